@@ -1,0 +1,21 @@
+"""Photon mapping with anisotropic density estimation, as plugins of Mitsuba 3.
+
+Importing this package registers the integrator ``aniso_pm`` and the BSDF ``asgconductor`` for
+the current Mitsuba variant and every later one. Import it before ``drjit`` and ``mitsuba``: it
+then also provides an LLVM that Dr.Jit can use (see :mod:`aniso_pm._llvm`).
+
+The mathematics is usable by itself: :mod:`aniso_pm.asg` (anisotropic spherical Gaussians),
+:mod:`aniso_pm.ndf` (roughness to ASG), :mod:`aniso_pm.warp` (half-vector to reflection) and
+:mod:`aniso_pm.kernel` (elliptical kernels).
+"""
+
+from aniso_pm import _llvm
+from aniso_pm._version import __version__
+
+_llvm.prepare()
+
+from aniso_pm import asg, kernel, ndf, plugins, warp  # noqa: E402  (Dr.Jit must load after LLVM)
+
+plugins.register()
+
+__all__ = ["__version__", "asg", "kernel", "ndf", "warp"]

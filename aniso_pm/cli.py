@@ -1,0 +1,298 @@
+"""The command line program ``aniso-pm``.
+
+Exit status: 0 done; 2 wrong usage or input, said in one line; 1 anything else; 130 interrupted,
+with the picture so far written where the integrator can give it. Mitsuba is imported inside the
+commands only.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from aniso_pm import _llvm, output
+from aniso_pm._version import __version__
+from aniso_pm.errors import InputError, is_interrupt, one_line
+
+INTERRUPTED = 130
+
+
+class InterruptError(Exception):
+    """Ctrl-C before there was a picture (typer would end silently on KeyboardInterrupt itself)."""
+
+
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the program with ``arguments`` (default: ``sys.argv``) and return its exit status."""
+    try:
+        return app(args=arguments, prog_name="aniso-pm", standalone_mode=False) or 0
+    except (InputError, output.OutputError) as error:
+        return _fail(2, str(error), error)
+    except BrokenPipeError:
+        # The reader of our output has left ("| head"): nobody to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except BaseException as error:
+        if hasattr(error, "format_message"):  # typer's own: wrong usage
+            return _fail(2, f"{error.format_message()} (see aniso-pm --help)", error)
+        if isinstance(error, InterruptError | typer.Abort) or is_interrupt(error):
+            return _fail(INTERRUPTED, "interrupted, nothing written", error)
+        if isinstance(error, SystemExit):
+            raise
+        return _fail(1, f"{type(error).__name__}: {one_line(error)}", error)
+
+
+def _fail(status: int, message: str, error: BaseException) -> int:
+    if os.environ.get("ANISO_PM_TRACEBACK"):
+        import traceback
+
+        traceback.print_exception(error)
+    print(f"aniso-pm: error: {one_line(message)}", file=sys.stderr)
+    return status
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"aniso-pm {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _program(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Say which.")
+    ] = False,
+) -> None:
+    """Photon mapping with anisotropic density estimation for Mitsuba 3.
+
+    With ANISO_PM_TRACEBACK=1 in the environment, errors come with their Python traceback.
+    """
+
+
+@app.command()
+def render(
+    scene: Annotated[Path, typer.Argument(help="Scene in Mitsuba's XML format.")],
+    out: Annotated[Path, typer.Option("--output", "-o", help="Picture to write (.exr).")],
+    variant: Annotated[str, typer.Option("--variant", "-m", help="Variant.")] = "llvm_ad_rgb",
+    define: Annotated[
+        list[str] | None,
+        typer.Option("--define", "-D", metavar="KEY=VALUE", help="Parameter $KEY of the scene."),
+    ] = None,
+    spp: Annotated[
+        int | None, typer.Option(min=1, max=2**31 - 1, help="Samples per pixel in all.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Random seed.")] = 0,
+    passes: Annotated[
+        int | None, typer.Option(min=1, max=2**31 - 1, help="Progressive passes.")
+    ] = None,
+    sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
+    png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no warnings.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
+    ] = False,
+) -> int:
+    """Render a scene with the integrator it names and write the picture as OpenEXR.
+
+    The header of the picture records parameters, seed, versions, timings and statistics.
+    """
+    # --- Find out what would fail, before anything slow ---
+    defines = _parse_defines(define or [])
+    if out.suffix.lower() != ".exr":
+        raise InputError(f"cannot write '{out}': the output's name must end in .exr")
+    picture = out.with_suffix(".png") if png else None
+    for path in filter(None, [out, picture]):
+        output.check_writable(path)
+    if not scene.is_file():
+        raise InputError(f"{scene}: there is no such file")
+
+    _set_variant(variant)
+    with _mitsuba_log(quiet):
+        # --- Load the scene ---
+        started = time.perf_counter()
+        world, camera, integrator = _load(scene, defines, sensor)
+        loaded = time.perf_counter()
+        if passes is not None:
+            if not hasattr(integrator, "passes"):
+                raise InputError(f"--passes: {integrator.class_name()} renders in one pass only")
+            integrator.passes = passes
+
+        # --- Render ---
+        statistics = _render(world, camera, integrator, seed, spp, quiet)
+        rendered = time.perf_counter()
+
+        # --- Write the picture and what made it ---
+        record = _record(integrator, statistics, camera)
+        record |= {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
+        record["seconds"] = {"load": loaded - started, "render": rendered - loaded}
+        output.write_exr(camera.film(), out, record)
+        if picture:
+            output.write_png(camera.film(), picture)
+
+    if as_json:
+        record |= {"output": str(out), "png": str(picture) if picture else None}
+        print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
+    if statistics.get("interrupted"):
+        print("aniso-pm: interrupted, the picture so far is written", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+@app.command()
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
+) -> int:
+    """Say what is installed and whether it works, with the fix for what does not."""
+    from aniso_pm import doctor as examination
+
+    checks = examination.examine()
+    print(examination.as_json(checks) if as_json else examination.as_text(checks))
+    return int(any(check.fix for check in checks))
+
+
+def _parse_defines(pairs: list[str]) -> dict[str, str]:
+    defines = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not key or not equals:
+            raise InputError(f"-D takes KEY=VALUE, not '{pair}'")
+        defines[key] = value
+    return defines
+
+
+def _set_variant(variant: str) -> None:
+    import mitsuba as mi
+
+    if variant not in mi.variants():
+        raise InputError(f"there is no variant '{variant}'; there are {', '.join(mi.variants())}")
+    try:
+        mi.set_variant(variant)
+    except ImportError as error:
+        reason = one_line(error)
+        if variant.startswith("llvm_"):
+            reason = _llvm.explain() or reason
+        elif variant.startswith("cuda_"):
+            reason = f"Dr.Jit finds no CUDA device or driver on this machine ({reason})"
+        raise InputError(f"variant '{variant}' cannot be used: {reason}") from error
+
+
+def _load(scene: Path, defines: dict[str, str], sensor: int):
+    """Scene, sensor and integrator; whatever is wrong with them is an InputError."""
+    import mitsuba as mi
+
+    try:
+        world = mi.load_file(str(scene), **defines)
+    except BaseException as error:
+        if is_interrupt(error):
+            raise InterruptError from error
+        reason = one_line(error)
+        raise InputError(reason if scene.name in reason else f"{scene}: {reason}") from error
+
+    if not isinstance(world, mi.Scene):
+        raise InputError(f"{scene}: the file describes a {type(world).__name__}, not a scene")
+    sensors, integrator = world.sensors(), world.integrator()
+    if integrator is None:
+        raise InputError(f"{scene}: the scene names no integrator")
+    if not sensors:
+        raise InputError(f"{scene}: the scene has no sensor")
+    if sensor >= len(sensors):
+        raise InputError(f"{scene}: no sensor {sensor}; the scene has {len(sensors)}, from 0")
+    if 0 in sensors[sensor].film().size():
+        raise InputError(f"{scene}: the film of sensor {sensor} has no pixels")
+    return world, sensors[sensor], integrator
+
+
+def _render(world, camera, integrator, seed: int, spp: int | None, quiet: bool) -> dict[str, Any]:
+    """Leave the picture in the camera's film; returns the integrator's statistics, or {}."""
+    try:
+        with _progress_bar(integrator, quiet):
+            # Not mi.render(): it hides errors inside a differentiable operation.
+            integrator.render(world, sensor=camera, seed=seed, spp=spp or 0)
+    except ValueError as error:
+        # Something the integrator cannot do with this scene or these parameters
+        raise InputError(one_line(error)) from error
+    except BaseException as error:
+        if is_interrupt(error):
+            raise InterruptError from error
+        raise
+    return dict(getattr(integrator, "statistics", None) or {})
+
+
+def _record(integrator, statistics: dict[str, Any], camera) -> dict[str, Any]:
+    from aniso_pm.doctor import versions
+
+    kind = type(integrator)
+    in_python = not kind.__module__.startswith("mitsuba")
+    return {
+        "integrator": kind.__name__ if in_python else integrator.class_name(),
+        "spp": camera.sampler().sample_count(),  # samplers may round what was asked for
+        "size": [int(pixels) for pixels in camera.film().size()],
+        "parameters": integrator.parameters() if hasattr(integrator, "parameters") else {},
+        "statistics": statistics,
+        "versions": versions(),
+    }
+
+
+@contextmanager
+def _progress_bar(integrator, quiet: bool) -> Iterator[None]:
+    if quiet or not sys.stderr.isatty() or not hasattr(integrator, "progress"):
+        yield
+        return
+
+    from tqdm import tqdm
+
+    with tqdm(file=sys.stderr, leave=False, dynamic_ncols=True) as bar:
+
+        def show(done: int, total: int, text: str) -> None:
+            bar.total, bar.n = total, done
+            bar.set_postfix_str(text)
+
+        integrator.progress = show
+        try:
+            yield
+        finally:
+            integrator.progress = None
+
+
+@contextmanager
+def _mitsuba_log(quiet: bool) -> Iterator[None]:
+    """Send Mitsuba's warnings to standard error, one line each, instead of standard output."""
+    import mitsuba as mi
+
+    class StandardError(mi.Appender):
+        def append(self, level, text) -> None:
+            if level >= mi.LogLevel.Warn and not quiet:
+                message = text.partition(" WARN ")[2] or text
+                print(f"aniso-pm: warning: {one_line(message.strip())}", file=sys.stderr)
+
+        def log_progress(self, *_) -> None:
+            pass
+
+    logger = mi.logger()
+    before = [logger.appender(index) for index in range(logger.appender_count())]
+    logger.clear_appenders()
+    logger.add_appender(StandardError())
+    try:
+        yield
+    finally:
+        logger.clear_appenders()
+        for appender in before:
+            logger.add_appender(appender)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

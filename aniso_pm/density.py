@@ -1,0 +1,123 @@
+"""Lobe + kernel + index → radiance estimate at the gather points   [paper step 4].
+
+With M light paths and photons of flux Φ_j at offsets d_j, the irradiance at p1 is
+
+    E ≈ Σ_j Φ_j w(d_j) / (M · π |s × t| · (1 − e^−4) · m),    w = exp(−a² − b²), a² + b² <= 4
+
+and the reflected radiance E times the BRDF of p1. Photons count only if they lie on the same
+surface: |d·n| within half a bandwidth and normals within 41 degrees (cosine 0.75).
+
+m is the share of the kernel that lies on such a surface. Without it every estimate near an edge
+loses what its kernel spills over the edge. Points drawn from the kernel are probed by short rays
+along −n until the first one lands; the number of rays is geometrically distributed with mean 1/m,
+so it *is* an unbiased estimate of 1/m, at the price of one ray wherever the kernel spills nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from . import index as spatial
+from .eye import GatherPoints
+from .kernel import PlaneKernel, disc, guarded_axes
+from .photons import PhotonMap, decode_normal, photon_flux, segments
+
+CUT2 = 4.0
+KERNEL_MASS = 1 - math.exp(-CUT2)
+# A photon on the same surface: offset along the normal in bandwidths, cosine between normals.
+SLAB = 0.5
+NORMAL_COS = 0.75
+# Rays after which the probe gives up: 1/m is taken to be at most this.
+PROBES_MAX = 12
+
+
+@dataclass(frozen=True)
+class KernelOptions:
+    """How a gather point gets its kernel; the integrator's parameters of the same names."""
+
+    anisotropic: bool
+    rule: str
+    size: str
+    epsilon: float
+    guard: bool
+    max_aspect: float
+
+
+def kernels(points: GatherPoints, radius, options: KernelOptions) -> tuple[PlaneKernel, Any]:
+    """(kernel, follows a lobe?) of each gather point; the disc where there is no lobe to follow."""
+    round_ = disc(points.n, radius)
+    path = points.path
+    if not options.anisotropic or path is None:
+        return round_, mi.Bool(False)
+    shaped = guarded_axes(
+        path.lobe,
+        path.r,
+        points.n,
+        path.distance,
+        radius,
+        options.epsilon,
+        options.rule,
+        options.guard,
+        options.max_aspect,
+        options.size,
+    )
+    usable = path.valid & dr.isfinite(dr.sum(shaped.s) + dr.sum(shaped.t))
+    usable &= dr.squared_norm(shaped.t) > 0
+    return dr.select(usable, shaped, round_), usable
+
+
+def estimate(
+    photons: PhotonMap, points: GatherPoints, kernel: PlaneKernel, radius, max_depth, active
+):
+    """(reflected radiance, photons inside the kernel) of each gather point, edges not yet
+    compensated.
+
+    max_depth: path segments of camera and light path together, or 0 for no limit (or none that
+    the map does not already keep).
+    """
+    ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
+    n = mi.Vector3f(points.n)
+    allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
+
+    def visit(total, slot, word, rho2, inside):
+        irradiance, count = total
+        inside &= dr.dot(decode_normal(word), n) > NORMAL_COS
+        if max_depth:
+            inside &= segments(word) <= allowed
+        weight = dr.select(inside, dr.exp(-rho2), 0)
+        return (
+            irradiance + weight * photon_flux(photons, slot, inside),
+            count + dr.select(inside, mi.UInt32(1), 0),
+        )
+
+    total = (mi.Spectrum(0), mi.UInt32(0))
+    irradiance, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active)
+    area = dr.pi * dr.sqrt(dr.squared_norm(kernel.s)) * dr.sqrt(dr.squared_norm(kernel.t))
+    return points.weight * irradiance / (area * (KERNEL_MASS * photons.emitted)), count
+
+
+@dr.syntax
+def probe_surface(scene, sampler, points: GatherPoints, kernel: PlaneKernel, radius, active):
+    """Unbiased estimate of 1/m, the inverse share of each kernel that lies on the surface."""
+    n = mi.Vector3f(points.n)
+    height = SLAB * radius
+    tries = mi.UInt32(0)
+    active = mi.Bool(active)
+    while active:
+        tries += 1
+        u = sampler.next_2d(active)
+        sin_phi, cos_phi = dr.sincos(dr.two_pi * u.y)
+        rho = dr.sqrt(-dr.log(1 - u.x * KERNEL_MASS))
+        q = points.p + kernel.s * (rho * cos_phi) + kernel.t * (rho * sin_phi)
+        probe = mi.Ray3f(q + n * height, -n)
+        probe.maxt = 2 * height
+        hit = scene.ray_intersect(probe, mi.RayFlags.Minimal, False, active)
+        facing = dr.abs(dr.dot(hit.n, n)) > NORMAL_COS
+        landed = hit.is_valid() & facing
+        active &= ~landed & (tries < PROBES_MAX)
+    return dr.maximum(mi.Float(tries), 1)

@@ -1,0 +1,124 @@
+"""Pictures on disk: the film as OpenEXR with everything that made it, and a PNG to look at.
+
+Files appear whole or not at all: they are written under another name in the same directory and
+renamed. Whether that can work is found out before the render (:func:`check_writable`), not after.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+class OutputError(Exception):
+    """A picture cannot be written where, or as what, it was asked for."""
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside ``path`` that takes its place if the block succeeds."""
+    partial = path.with_name(f".{path.stem}.partial.{os.getpid()}{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        raise OutputError(f"cannot write '{path}': {error.strerror or error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def check_writable(path: Path) -> None:
+    """Raise :class:`OutputError` unless a file can be put at ``path``, by trying it beside it."""
+    if path.is_dir():
+        raise OutputError(f"cannot write '{path}': it is a directory")
+    if not path.parent.is_dir():
+        raise OutputError(f"cannot write '{path}': there is no directory '{path.parent}'")
+    partial = path.with_name(f".{path.stem}.partial.{os.getpid()}{path.suffix}")
+    try:
+        partial.touch()
+        partial.unlink()
+    except OSError as error:
+        raise OutputError(f"cannot write '{path}': {error.strerror or error}") from error
+
+
+def plain(value: Any) -> Any:
+    """``value`` in JSON's own types: one-element arrays are numbers, NaN and infinities null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, str | bool | int) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "numpy"):  # Dr.Jit arrays
+        value = value.numpy()
+    if hasattr(value, "tolist"):  # NumPy arrays and scalars
+        value = value.tolist()
+        return plain(value[0] if isinstance(value, list) and len(value) == 1 else value)
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    return str(value)
+
+
+def write_exr(film, path: Path, record: Mapping[str, Any]) -> None:
+    """Write ``film`` with all its channels as OpenEXR.
+
+    ``record`` (nested mappings) goes into the header twice: whole, as JSON, in the attribute
+    ``aniso_pm``; and flat, one attribute ``aniso_pm.outer.inner`` for each number or text.
+    """
+    import mitsuba as mi
+
+    bitmap = film.bitmap()
+    # Only its text tells in which format the film wants to be stored. Pictures with AOVs stay
+    # float32: Mitsuba's conversion renames such channels and then fails to find them.
+    if "component_format = float16" in str(film):
+        if bitmap.pixel_format() != mi.Bitmap.PixelFormat.MultiChannel:
+            bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16, srgb_gamma=False)
+
+    record = plain(record)
+    metadata = bitmap.metadata()
+    metadata["aniso_pm"] = json.dumps(record, ensure_ascii=False, allow_nan=False)
+    for key, value in _flatten("aniso_pm", record):
+        metadata[key] = value
+    with _replacing(path) as partial:
+        try:
+            bitmap.write(str(partial))
+        except RuntimeError as error:
+            raise OutputError(f"cannot write '{path}': {error}") from error
+
+
+def _flatten(prefix: str, value: Any) -> Iterator[tuple[str, str | int | float]]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _flatten(f"{prefix}.{key}", item)
+    elif isinstance(value, bool):
+        yield prefix, int(value)
+    elif isinstance(value, int) and not -(2**31) <= value < 2**31:
+        yield prefix, float(value)  # the header's integers have 32 bits
+    elif isinstance(value, list):
+        yield prefix, json.dumps(value, ensure_ascii=False)
+    elif value is not None:
+        yield prefix, value
+
+
+def write_png(film, path: Path) -> None:
+    """Write the colour (and alpha) channels of ``film`` as an 8-bit sRGB PNG, clipped at 1."""
+    import mitsuba as mi
+
+    parts = film.bitmap().split()
+    colour = next((bitmap for name, bitmap in parts if name == "<root>"), None)
+    Format = mi.Bitmap.PixelFormat
+    if colour is None or colour.pixel_format() == Format.MultiChannel:
+        raise OutputError(f"cannot write '{path}': the film has no colour channels")
+    has_alpha = colour.pixel_format() in (Format.YA, Format.RGBA, Format.XYZA)
+    picture = colour.convert(
+        pixel_format=Format.RGBA if has_alpha else Format.RGB,
+        component_format=mi.Struct.Type.UInt8,
+        srgb_gamma=True,
+    )
+    with _replacing(path) as partial:
+        picture.write(str(partial))

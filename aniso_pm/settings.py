@@ -1,0 +1,80 @@
+"""The integrator's parameters: types, ranges, defaults. The plugin's documentation says what each
+one means; this module says what each one may be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+from .kernel import RULES
+
+_UNLIMITED = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Validated parameters, in Mitsuba's own names. Raises ValueError for a value out of range and
+    TypeError for one of the wrong type; the message names parameter, value and accepted range."""
+
+    kernel: str = "anisotropic"
+    rule: str = "lobe"
+    size: str = "bandwidth"
+    epsilon: float = 0.02
+    guard: bool = True
+    max_aspect: float = 32.0
+    photon_count: int = 250_000
+    passes: int = 1
+    alpha: float = 2 / 3
+    initial_radius: float = 0.0
+    edge_compensation: bool = True
+    max_depth: int = -1
+    rr_depth: int = 5
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            wanted = type(field.default)
+            # Mitsuba hands over integers where a float is meant ("1"), never the reverse.
+            if wanted is float and type(value) is int:
+                object.__setattr__(self, field.name, float(value))
+            elif type(value) is not wanted:
+                name = {bool: "boolean", int: "integer", float: "float", str: "string"}[wanted]
+                raise TypeError(
+                    f'aniso_pm: parameter "{field.name}" must be of type {name}, '
+                    f"got {value!r} ({type(value).__name__})"
+                )
+        self._one_of("kernel", "anisotropic", "isotropic")
+        self._one_of("rule", *RULES)
+        self._one_of("size", "bandwidth", "epsilon")
+        self._between("epsilon", 1e-8, 10)
+        self._between("max_aspect", 1, 1e4)
+        self._between("photon_count", 1, 10**9)
+        self._between("passes", 1, 10**7)
+        self._between("alpha", 0, 1, "above 0 and at most 1", self.alpha > 0)
+        self._between("initial_radius", 0, 1e30, "0 (automatic) or a positive length")
+        self._between("max_depth", -1, 10**6, "-1 (unlimited) or 1 and more", self.max_depth != 0)
+        self._between("rr_depth", 1, 10**6)
+
+    def _one_of(self, name, *choices):
+        value = getattr(self, name)
+        if value not in choices:
+            raise ValueError(
+                f'aniso_pm: parameter "{name}" is "{value}"; it must be one of {", ".join(choices)}'
+            )
+
+    def _between(self, name, low, high, words=None, also=True):
+        value = getattr(self, name)
+        if not (math.isfinite(value) and low <= value <= high and also):
+            raise ValueError(
+                f'aniso_pm: parameter "{name}" is {value}; '
+                f"it must be {words or f'between {low:g} and {high:g}'}"
+            )
+
+    @property
+    def depth_limit(self) -> int:
+        """Path segments of a whole light path, a large number where there is no limit."""
+        return _UNLIMITED if self.max_depth == -1 else self.max_depth
+
+    def with_(self, **changes) -> Settings:
+        """A copy with some parameters changed, validated again."""
+        return replace(self, **changes)

@@ -1,0 +1,200 @@
+"""The integrator plugin ``aniso_pm``: parameters, Mitsuba's render() contract, statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+from aniso_pm import progressive
+from aniso_pm.settings import Settings
+
+
+class AnisoPhotonMapper:
+    r"""
+    .. _integrator-aniso_pm:
+
+    Anisotropic photon mapper (:monosp:`aniso_pm`)
+    ----------------------------------------------
+
+    .. pluginparameters::
+
+     * - kernel
+       - |string|
+       - ``anisotropic``: where an eye path reaches a diffuse surface over an anisotropic glossy
+         one, the density-estimation kernel follows the reflection lobe. ``isotropic``: discs
+         everywhere, the conventional photon mapper. (Default: ``anisotropic``)
+
+     * - rule
+       - |string|
+       - Shape of the ellipse: ``lobe`` (covariance proportional to the lobe's), ``taylor`` (equal
+         relative change of the lobe along both axes) or ``paper`` (the published formula).
+         (Default: ``lobe``)
+
+     * - guard
+       - |bool|
+       - Let no ellipse outgrow the footprint of the lobe that it stands for: narrow footprints get
+         a disc. Without it kernels near the reflecting surface reach around objects and darken the
+         image. (Default: |true|)
+
+     * - size
+       - |string|
+       - ``bandwidth``: all kernels have the area of the disc of the current radius. ``epsilon``:
+         the literal size of the rule, whatever number of photons that means.
+         (Default: ``bandwidth``)
+
+     * - epsilon
+       - |float|
+       - Relative change of the lobe that defines the axes of ``taylor`` and ``paper``, between
+         1e-8 and 10. (Default: 0.02)
+
+     * - max_aspect
+       - |float|
+       - Largest ratio of a kernel's axes, between 1 and 10,000. (Default: 32)
+
+     * - photon_count
+       - |int|
+       - Light paths per pass. (Default: 250000)
+
+     * - passes
+       - |int|
+       - Number of passes with fresh photons and fresh eye paths; the samples per pixel are the
+         total over all passes. (Default: 1)
+
+     * - initial_radius
+       - |float|
+       - Kernel radius r of the first pass in world units: weight exp(-a²-b²) with half axes of
+         :math:`|s \times t| = r^2`, cut at :math:`a^2+b^2=4`. 0 chooses the radius at which the
+         median gather point has 60 photons in its kernel. (Default: 0)
+
+     * - alpha
+       - |float|
+       - The kernel's area shrinks by :math:`(i+\alpha)/(i+1)` after pass :math:`i`, above 0 and at
+         most 1. (Default: 2/3)
+
+     * - edge_compensation
+       - |bool|
+       - Divide each estimate by the share of its kernel that lies on the surface, found by short
+         rays. Without it every edge is dark. (Default: |true|)
+
+     * - max_depth
+       - |int|
+       - Longest path depth, counted as :ref:`path <integrator-path>` does: segments of the whole
+         path from light to camera. -1 is unlimited, 1 shows emitters only, 2 adds direct light.
+         (Default: -1)
+
+     * - rr_depth
+       - |int|
+       - Path depth at which Russian roulette begins, for eye and light paths alike. (Default: 5)
+
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: |false|)
+
+    Direct light comes from emitter sampling combined with BSDF sampling; everything that reaches a
+    Lambertian surface over two path segments or more comes from the photon map. Surfaces that are
+    not Lambertian are walked through by photons and eye paths, as a path tracer does.
+
+    After ``render()`` the attribute ``statistics`` holds counts and timings. The attribute
+    ``progress`` may be set to a function (done, total, text) that is called after each pass.
+
+    .. warning:: Participating media, the polarized and spectral variants and derivatives are
+       refused. The program :monosp:`mitsuba` cannot load plugins written in Python; use
+       :monosp:`aniso-pm render`.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="aniso_pm">
+                <integer name="photon_count" value="500000"/>
+                <integer name="passes" value="16"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'aniso_pm',
+            'photon_count': 500_000,
+            'passes': 16
+    """
+
+    def __init__(self, props):
+        mi.SamplingIntegrator.__init__(self, props)
+        given = {f.name: props[f.name] for f in fields(Settings) if f.name in props}
+        self.settings = Settings(**given)
+        self.statistics: dict[str, Any] = {}
+        self.progress: Callable[[int, int, str], None] | None = None
+        self._map: tuple | None = None  # (scene, prepared scene, photon map, radius) of sample()
+
+    # --- Mitsuba's interface ---
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """Render the scene; see ``mi.Integrator.render``. With several passes ``spp`` is their
+        total."""
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        with dr.suspend_grad():
+            prepared = progressive.prepare(scene, self.settings, self.hide_emitters)
+            self.statistics = progressive.render(
+                prepared, sensor, _as_int(seed), spp, self.progress or (lambda *_: None)
+            )
+            image = sensor.film().develop() if develop else mi.TensorXf()
+            if evaluate:
+                dr.eval(image)
+                dr.sync_thread()
+        return image
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """Radiance along rays; see ``mi.SamplingIntegrator.sample``.
+
+        For integrators that contain this one (``aov``, ``moment``): a photon map is made at the
+        first call for a scene and kept for the following ones.
+        """
+        active = mi.Bool(active)
+        if self._map is None or self._map[0] is not scene:
+            prepared = progressive.prepare(scene, self.settings, self.hide_emitters)
+            radius = self.settings.initial_radius or progressive.automatic_radius(
+                prepared, scene.sensors()[0], 0
+            )
+            self._map = (scene, prepared, progressive.photon_map(prepared, 0, 0), radius)
+        _, prepared, map_, radius = self._map
+        L, valid = progressive.estimate_radiance(prepared, map_, radius, sampler, ray, active)
+        return L, valid, []
+
+    def aov_names(self):
+        return []
+
+    def render_forward(self, *args, **kwargs):
+        raise NotImplementedError(_NO_DERIVATIVES)
+
+    def render_backward(self, *args, **kwargs):
+        raise NotImplementedError(_NO_DERIVATIVES)
+
+    # --- Ours ---
+
+    @property
+    def passes(self) -> int:
+        return self.settings.passes
+
+    @passes.setter
+    def passes(self, value: int):
+        self.settings = self.settings.with_(passes=value)
+
+    def parameters(self) -> dict[str, Any]:
+        """All parameters with their values, as they would be given in a scene."""
+        return asdict(self.settings) | {"hide_emitters": self.hide_emitters}
+
+    def to_string(self):
+        values = ",\n  ".join(f"{name} = {value}" for name, value in self.parameters().items())
+        return f"AnisoPhotonMapper[\n  {values}\n]"
+
+
+_NO_DERIVATIVES = (
+    "aniso_pm: derivatives are not supported (density estimation is not differentiable with "
+    'respect to where photons land); use "prb" for gradients'
+)
+
+
+def _as_int(seed) -> int:
+    return int(seed) if isinstance(seed, int) else int(mi.UInt32(seed)[0])

@@ -1,0 +1,35 @@
+"""Fixtures that set a Mitsuba variant for one test and set the earlier one again afterwards."""
+
+import aniso_pm  # noqa: F401  (before drjit, so that it can choose LLVM)  # isort: skip
+import mitsuba as mi
+import pytest
+
+VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral")
+
+
+def _use(variant):
+    before = mi.variant()
+    mi.set_variant(variant)
+    yield variant
+    if before:
+        mi.set_variant(before)
+
+
+@pytest.fixture
+def variant_llvm_rgb():
+    yield from _use("llvm_ad_rgb")
+
+
+@pytest.fixture
+def variant_llvm_mono():
+    yield from _use("llvm_ad_mono")
+
+
+@pytest.fixture
+def variant_llvm_spectral():
+    yield from _use("llvm_ad_spectral")
+
+
+@pytest.fixture(params=VARIANTS)
+def variants_all(request):
+    yield from _use(request.param)

@@ -1,0 +1,286 @@
+"""What the modules should compute, written a second time from the formulas in double precision
+(numpy, whole arrays) and in 40 digits (mpmath, one case at a time).
+
+All inputs are float64 arrays whose values are float32 numbers: the references see what the modules
+see, so that a difference is the module's and not the rounding of its inputs.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import aniso_pm  # before drjit and mitsuba: it chooses their LLVM
+
+# isort: split
+import mitsuba as mi
+import numpy as np
+from mpmath import mp, mpf
+
+mp.dps = 40
+
+
+# --- Between numpy, Dr.Jit and mpmath ------------------------------------------------------------
+
+
+def f32(a):
+    """Round to single precision, keep as double."""
+    return np.asarray(a, np.float32).astype(np.float64)
+
+
+def vec(a):
+    """(n, 3) or (3,) array → mi.Vector3f."""
+    return mi.Vector3f(*np.asarray(a, np.float32).reshape(-1, 3).T.copy())
+
+
+def flt(a):
+    return mi.Float(np.asarray(a, np.float32).reshape(-1).copy())
+
+
+def arr(a):
+    """Dr.Jit array → float64 numpy array, vectors as (n, 3)."""
+    a = np.array(a, np.float64)
+    return a.T if a.ndim == 2 else a
+
+
+def unit(a):
+    return a / np.linalg.norm(a, axis=-1, keepdims=True)
+
+
+def dot(a, b):
+    return np.sum(a * b, axis=-1)
+
+
+# --- Random lobes and directions -----------------------------------------------------------------
+
+
+def random_frames(rng, n):
+    """n right-handed orthonormal frames (x, y, z), rounded."""
+    z = unit(rng.normal(size=(n, 3)))
+    x = rng.normal(size=(n, 3))
+    x = unit(x - z * dot(x, z)[:, None])
+    return f32(x), f32(np.cross(z, x)), f32(z)
+
+
+def lobes(x, y, z, lam, mu, amplitude=1.0):
+    n = len(x)
+    lam, mu, amplitude = (f32(np.broadcast_to(a, n)) for a in (lam, mu, amplitude))
+    return SimpleNamespace(x=x, y=y, z=z, lam=lam, mu=mu, amplitude=amplitude)
+
+
+def random_lobes(rng, n, low=1.0, high=1e6):
+    """n lobes, each bandwidth log-uniform in [low, high]."""
+    lam, mu = np.exp(rng.uniform(np.log(low), np.log(high), (2, n)))
+    return lobes(*random_frames(rng, n), lam, mu)
+
+
+def asg(lobe):
+    """The reference's lobes as the module's."""
+    return aniso_pm.asg.ASG(
+        vec(lobe.x), vec(lobe.y), vec(lobe.z), flt(lobe.lam), flt(lobe.mu), flt(lobe.amplitude)
+    )
+
+
+def one(lobe, i):
+    return SimpleNamespace(**{k: v[i : i + 1] for k, v in vars(lobe).items()})
+
+
+def from_local(lobe, a, b):
+    """Unit directions with v·x = a, v·y = b on the lobe's side, rounded."""
+    s = np.sqrt(np.maximum(1 - a * a - b * b, 0))
+    return f32(unit(lobe.x * a[:, None] + lobe.y * b[:, None] + lobe.z * s[:, None]))
+
+
+def directions(rng, lobe, sigmas, edge=0.97):
+    """Directions `sigmas` standard deviations (1/√2λ, 1/√2μ) from the lobe's centre, in random
+    directions, held at v·z > √(1 − edge²)."""
+    phi = rng.uniform(0, 2 * np.pi, len(lobe.lam))
+    a = sigmas * np.cos(phi) / np.sqrt(2 * lobe.lam)
+    b = sigmas * np.sin(phi) / np.sqrt(2 * lobe.mu)
+    shrink = edge / np.maximum(np.hypot(a, b), edge)
+    return from_local(lobe, a * shrink, b * shrink)
+
+
+def tangents(rng, v):
+    """A random unit tangent at each v, rounded."""
+    d = rng.normal(size=v.shape)
+    v = unit(v)
+    return f32(unit(d - v * dot(d, v)[:, None]))
+
+
+# --- ln G and its derivatives in double precision ------------------------------------------------
+
+
+def log_g(lobe, v):
+    """ln G at unit v (amplitude left out)."""
+    a, b, s = dot(v, lobe.x), dot(v, lobe.y), dot(v, lobe.z)
+    return np.log(s) - lobe.lam * a * a - lobe.mu * b * b
+
+
+def log_gradient(lobe, v):
+    v = unit(v)
+    a, b, s = (dot(v, axis)[:, None] for axis in (lobe.x, lobe.y, lobe.z))
+    g = lobe.z / s - 2 * lobe.lam[:, None] * a * lobe.x - 2 * lobe.mu[:, None] * b * lobe.y
+    return g - v * dot(g, v)[:, None]
+
+
+def log_hessian(lobe, v, d, e):
+    """Bilinear form of the geodesic second derivative of ln G, tangents d and e."""
+    v = unit(v)
+    a, b, s = (dot(v, axis) for axis in (lobe.x, lobe.y, lobe.z))
+    along = dot(d, lobe.z) * dot(e, lobe.z) / s**2
+    along += 2 * lobe.lam * dot(d, lobe.x) * dot(e, lobe.x)
+    along += 2 * lobe.mu * dot(d, lobe.y) * dot(e, lobe.y)
+    return -along - dot(d, e) * (1 - 2 * lobe.lam * a * a - 2 * lobe.mu * b * b)
+
+
+def log_second_derivative(lobe, v, d):
+    v = unit(v)
+    d = unit(d - v * dot(d, v)[:, None])
+    return log_hessian(lobe, v, d, d)
+
+
+# --- The kernel axes in double precision ---------------------------------------------------------
+
+
+def tangent_basis(v):
+    """An orthonormal basis of the tangent plane at each v (any)."""
+    helper = np.where(np.abs(v[:, :1]) < 0.6, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    e = unit(np.cross(v, helper))
+    return e, np.cross(unit(v), e)
+
+
+def taylor_axes(lobe, r, epsilon):
+    """The rule "taylor" of design.md, section 1: eigenvectors of g gᵀ/ε² + |H|/(2ε), lengths
+    l(d) = 2ε/(|g·d| + √((g·d)² + 2ε|κ(d)|)). Returns u, v and the |κ| along v."""
+    r = unit(r)
+    e, f = tangent_basis(r)
+    g = log_gradient(lobe, r)
+    g = np.stack([dot(g, e), dot(g, f)], -1)
+    h = np.empty((len(r), 2, 2))
+    h[:, 0, 0], h[:, 1, 1] = log_hessian(lobe, r, e, e), log_hessian(lobe, r, f, f)
+    h[:, 0, 1] = h[:, 1, 0] = log_hessian(lobe, r, e, f)
+    values, q = np.linalg.eigh(h)
+    positive = np.einsum("nij,nj,nkj->nik", q, np.abs(values), q)
+    _, q = np.linalg.eigh(g[:, :, None] * g[:, None, :] / epsilon**2 + positive / (2 * epsilon))
+
+    def axis(d):
+        slope = np.abs(dot(g, d))
+        curvature = np.abs(np.einsum("ni,nij,nj->n", d, h, d) + slope**2)
+        length = 2 * epsilon / (slope + np.sqrt(slope**2 + 2 * epsilon * curvature))
+        return (e * d[:, :1] + f * d[:, 1:]) * length[:, None], curvature
+
+    (u, curvature_u), (v, curvature_v) = axis(q[:, :, 1]), axis(q[:, :, 0])
+    return u, v, curvature_u, curvature_v
+
+
+def paper_axes(lobe, r, epsilon):
+    """The rule "paper", as printed: l_u = ε/|g|, l_v = 2ε/|(∂²G/∂v²)/G|."""
+    r = unit(r)
+    g = log_gradient(lobe, r)
+    norm = np.linalg.norm(g, axis=-1, keepdims=True)
+    v_d = np.cross(r, g / norm)
+    curvature = np.abs(log_hessian(lobe, r, v_d, v_d))  # g·v_d = 0
+    return epsilon * g / norm**2, v_d * (2 * epsilon / curvature)[:, None], curvature
+
+
+def lobe_axes(lobe, r, epsilon):
+    """The rule "lobe": √(ε/λ), √(ε/μ) along x, y turned by the smallest rotation z → r."""
+    r = unit(r)
+    axis = np.cross(lobe.z, r)  # Rodrigues
+    cosine = dot(lobe.z, r)[:, None]
+
+    def turn(w):
+        return w * cosine + np.cross(axis, w) + axis * dot(axis, w)[:, None] / (1 + cosine)
+
+    return (
+        turn(lobe.x) * np.sqrt(epsilon / lobe.lam)[:, None],
+        turn(lobe.y) * np.sqrt(epsilon / lobe.mu)[:, None],
+    )
+
+
+def ellipse(u, v, e, f):
+    """u uᵀ + v vᵀ in the basis (e, f): (n, 2, 2)."""
+    w = np.stack([np.stack([dot(u, e), dot(v, e)], -1), np.stack([dot(u, f), dot(v, f)], -1)], -2)
+    return w @ np.swapaxes(w, -1, -2)
+
+
+def relative_difference(m, reference):
+    """Largest |m − reference| along any direction, relative to `reference` in that direction:
+    the spectral norm of R^(−1/2) (m − R) R^(−1/2). Sees the short axis as well as the long one."""
+    values, q = np.linalg.eigh(reference)
+    whiten = q / np.sqrt(values)[..., None, :]
+    difference = np.swapaxes(whiten, -1, -2) @ (m - reference) @ whiten
+    return np.abs(np.linalg.eigvalsh(0.5 * (difference + np.swapaxes(difference, -1, -2)))).max(-1)
+
+
+# --- The same in 40 digits, one lobe at a time ---------------------------------------------------
+
+
+def mp_vec(a):
+    return mp.matrix([mpf(float(c)) for c in np.asarray(a).reshape(3)])
+
+
+def mp_dot(a, b):
+    return sum(a[i] * b[i] for i in range(3))
+
+
+def mp_unit(a):
+    return a / mp.sqrt(mp_dot(a, a))
+
+
+def mp_cross(a, b):
+    return mp.matrix(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def mp_log_g(lobe, i):
+    """v → ln G of the i-th lobe; v unit."""
+    x, y, z = mp_vec(lobe.x[i]), mp_vec(lobe.y[i]), mp_vec(lobe.z[i])
+    lam, mu = mpf(float(lobe.lam[i])), mpf(float(lobe.mu[i]))
+    return lambda v: mp.log(mp_dot(v, z)) - lam * mp_dot(v, x) ** 2 - mu * mp_dot(v, y) ** 2
+
+
+def mp_geodesic_differences(function, v, d, step):
+    """First and second central difference of `function` along v cos t + d sin t at t = 0.
+    v, d are made exactly orthonormal. With 40 digits and a step of 1e-9 standard deviations both
+    truncation (1e-18) and rounding (1e-22) are below double precision."""
+    v = mp_unit(v)
+    d = mp_unit(d - v * mp_dot(d, v))
+    step = mpf(step)
+    cosine, sine = mp.cos(step), mp.sin(step)
+    plus, zero, minus = (
+        function(v * cosine + d * sine),
+        function(v),
+        function(v * cosine - d * sine),
+    )
+    return (plus - minus) / (2 * step), (plus - 2 * zero + minus) / step**2
+
+
+def mp_taylor_axes(lobe, i, r, epsilon):
+    """The rule "taylor" with derivatives by finite differences of ln G and G along geodesics:
+    shares nothing with the closed forms. Returns u, v (numpy)."""
+    function = mp_log_g(lobe, i)
+    r, epsilon = mp_unit(mp_vec(r)), mpf(float(np.float32(epsilon)))
+    step = mpf("1e-9") / mp.sqrt(2 * float(max(lobe.lam[i], lobe.mu[i])) + 2)
+    helper = mp.matrix([1, 0, 0]) if abs(r[0]) < 0.6 else mp.matrix([0, 1, 0])
+    e = mp_unit(mp_cross(r, helper))
+    f = mp_cross(r, e)
+    g1, h11 = mp_geodesic_differences(function, r, e, step)
+    g2, h22 = mp_geodesic_differences(function, r, f, step)
+    _, mixed = mp_geodesic_differences(function, r, e + f, step)
+    h12 = mixed - (h11 + h22) / 2
+    values, q = mp.eigsy(mp.matrix([[h11, h12], [h12, h22]]))
+    positive = q * mp.diag([abs(values[0]), abs(values[1])]) * q.T
+    g = mp.matrix([g1, g2])
+    _, q = mp.eigsy(g * g.T / epsilon**2 + positive / (2 * epsilon))
+    axes = []
+    centre = function(r)
+    for k in (1, 0):
+        d = e * q[0, k] + f * q[1, k]
+        slope = abs(mp_geodesic_differences(function, r, d, step)[0])
+        # (∂²G/∂d²)/G from G itself, relative to its value at r.
+        _, curvature = mp_geodesic_differences(lambda w: mp.exp(function(w) - centre), r, d, step)
+        length = 2 * epsilon / (slope + mp.sqrt(slope**2 + 2 * epsilon * abs(curvature)))
+        axes.append(np.array([float(c) for c in d * length]))
+    return axes
