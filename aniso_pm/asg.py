@@ -151,10 +151,13 @@ class ASG:
     def log_second_derivative(self, v, d):
         """Second derivative of ln G at v along the geodesic that leaves v in the unit tangent
         direction d, 1/rad²; 0 where v·z <= 0."""
-        t = self.tangent_derivatives(v)
-        d = mi.Vector3f(d)
-        d1, d2 = dr.dot(d, t.e1), dr.dot(d, t.e2)
-        return t.h11 * d1 * d1 + 2 * t.h12 * d1 * d2 + t.h22 * d2 * d2
+        # Not from the Hessian's entries: near the horizon they cancel in the term (d·z)²/s².
+        a, b, s = self._local(v)
+        dx, dy, dz = self._local(d)
+        radial = dz * dr.rcp(dr.maximum(s, S_MIN))
+        bend = 1 - 2 * self.lam * a * a - 2 * self.mu * b * b
+        second = -radial * radial - 2 * self.lam * dx * dx - 2 * self.mu * dy * dy - bend
+        return dr.select(s > 0, second, 0)
 
     def integral(self):
         """∫ amplitude · G dω over the sphere, relative error below 1e-5.
@@ -171,8 +174,9 @@ class ASG:
         """Draw directions v from the lobe: (v, pdf), pdf in 1/sr. u2: uniform in [0, 1)².
 
         An angle φ is drawn uniformly, then a radius ρ with density ∝ ρ exp(−ρ²) so far that
-        a = ρ cos φ/√λ, b = ρ sin φ/√μ stays in the unit disc. For bandwidths above 20 this is the
-        exact distribution G / ∫G; below, the truncation depends on φ.
+        a = ρ cos φ/√λ, b = ρ sin φ/√μ stays in the unit disc. For bandwidths above 20, and for
+        λ = μ, this is the exact distribution G / ∫G; else the truncation depends on φ. Bandwidths
+        below 1 are raised towards the other one, which keeps G / pdf within a factor of e.
         """
         u2 = mi.Point2f(u2)
         lam, mu = self._positive_bandwidths()
@@ -191,7 +195,9 @@ class ASG:
         return self._pdf(a, b, s, *self._positive_bandwidths())
 
     def _positive_bandwidths(self):
-        return dr.maximum(self.lam, 1e-6), dr.maximum(self.mu, 1e-6)
+        lam = dr.maximum(self.lam, dr.minimum(self.mu, 1))
+        mu = dr.maximum(self.mu, dr.minimum(self.lam, 1))
+        return dr.maximum(lam, 1e-6), dr.maximum(mu, 1e-6)
 
     @staticmethod
     def _pdf(a, b, s, lam, mu):
@@ -301,7 +307,7 @@ def _log1p(t):
     return dr.select(dr.abs(t) < 0.01, series, dr.log(1 + t))
 
 
-def _disc_integral(p, q, nodes: int = 24):
+def _disc_integral(p, q, nodes: int = 32):
     """∫ exp(−p a² − q b²) over the unit disc for 0 <= p <= q (see ASG.integral)."""
     # Closed form where the disc's edge is out of reach: exp(−16) < 2e-7.
     flat = dr.pi * dr.rsqrt(p) * dr.rsqrt(q)

@@ -7,8 +7,8 @@ segments or more is the photon map's. A path that never meets a receiver is path
 else, so the two halves together count every light path exactly once.
 
 Along the way the path remembers the reflection lobe of its last glossy vertex, where that vertex
-was anisotropic. Mirrors between the lobe and the gather point reflect the lobe along; refraction turns
-it by the angle between the rays.
+was anisotropic. Mirrors between the lobe and the gather point reflect the lobe along; refraction
+turns it by the angle between the rays.
 """
 
 from __future__ import annotations

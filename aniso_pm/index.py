@@ -1,11 +1,11 @@
 """Points → implicit bounding-volume hierarchy; sums over elliptical neighbourhoods.
 
 Points are sorted along a Morton curve of 21 bits an axis (a coin in a stadium: 2e6 cells along
-the longest side) and cut into leaves of LEAF points. The leaves are the bottom row of a complete binary
-tree in heap order: node i has the children 2i and 2i + 1, leaf j is node n_leaves + j, no pointer is
-stored. Boxes are made by pairwise minima and maxima, level by level. The traversal needs no stack:
-a node that is hit goes to 2i; otherwise to the next node in depth-first order, which is i + 1 with
-its trailing zeros shifted out (1 means: finished).
+the longest side) and cut into leaves of LEAF points. The leaves are the bottom row of a complete
+binary tree in heap order: node i has the children 2i and 2i + 1, leaf j is node n_leaves + j, no
+pointer is stored. Boxes are made by pairwise minima and maxima, level by level. The traversal needs
+no stack: a node that is hit goes to 2i; otherwise to the next node in depth-first order, which is
+i + 1 with its trailing zeros shifted out (1 means: finished).
 
 A neighbourhood is an elliptical cylinder {d : (a·d)² + (b·d)² <= cut², |c·d| <= 1} around a
 centre. Its test against a box costs the same at any aspect ratio, so a thin ellipse visits the

@@ -1,7 +1,6 @@
 """From a reflection lobe to an elliptical kernel on a plane   [paper steps 2 to 4].
 
-At the direction r the rule gives two tangent vectors u, v (radians): along u the lobe changes
-fastest. They are projected along r to the receiver's tangent plane, giving s, t (world units), and
+At the direction r the rule gives two tangent vectors u, v (radians). They are projected along r to the receiver's tangent plane, giving s, t (world units), and
 a photon at offset d = a s + b t weighs exp(−a² − b²), a kernel of integral π |s × t| and of
 covariance (s sᵀ + t tᵀ)/2.
 
@@ -64,7 +63,7 @@ def kernel_axes(lobe: ASG, r, epsilon=0.02, rule="taylor"):
         v = t.e2 * dr.sqrt(epsilon / dr.maximum(lobe.mu, tiny))
         return u, v
 
-    cos_t, sin_t = _steep_direction(t, epsilon)
+    cos_t, sin_t, mixed, high = _steep_direction(t, epsilon)
     if rule == "paper":
         # Along g itself wherever there is a gradient to speak of.
         norm = dr.hypot(t.g1, t.g2)
@@ -78,25 +77,28 @@ def kernel_axes(lobe: ASG, r, epsilon=0.02, rule="taylor"):
     scale = 2 * dr.maximum(lobe.lam, lobe.mu) + 1
     floor_g, floor_k = 1e-7 * dr.sqrt(scale), 1e-7
 
-    def slope_and_curvature(c, s):
-        slope = dr.abs(t.g1 * c + t.g2 * s)
+    def curvature(c, s, slope):
         second = t.h11 * c * c + 2 * t.h12 * c * s + t.h22 * s * s
-        return slope, dr.abs(second + slope * slope)
+        return dr.maximum(dr.abs(second + slope * slope), floor_k)
 
+    slope_u = dr.abs(t.g1 * cos_t + t.g2 * sin_t)
     if rule == "paper":
-        slope, _ = slope_and_curvature(cos_t, sin_t)
-        _, curvature = slope_and_curvature(-sin_t, cos_t)
-        length_u = epsilon / dr.maximum(slope, floor_g)
-        length_v = 2 * epsilon / dr.maximum(curvature, floor_k)
+        length_u = epsilon / dr.maximum(slope_u, floor_g)
+        length_v = 2 * epsilon / curvature(-sin_t, cos_t, 0)
     else:
 
-        def taylor_length(c, s):
-            slope, curvature = slope_and_curvature(c, s)
-            curvature = dr.maximum(curvature, floor_k)
+        def taylor_length(slope, kappa):
             # (g·d)² + 2ε|κ| as a hypotenuse: the squares may leave the single-precision range.
-            return 2 * epsilon / (slope + _hypot(slope, dr.sqrt(2 * epsilon) * dr.sqrt(curvature)))
+            return 2 * epsilon / (slope + _hypot(slope, dr.sqrt(2 * epsilon) * dr.sqrt(kappa)))
 
-        length_u, length_v = taylor_length(cos_t, sin_t), taylor_length(-sin_t, cos_t)
+        slope_v = dr.abs(t.g2 * cos_t - t.g1 * sin_t)
+        # Far from the centre v is almost perpendicular to g and this product all rounding. There
+        # the eigenvectors' own condition uᵀ(g gᵀ + ε|H|/2)v = 0 gives g·v without cancellation.
+        small = (slope_v < 0.1 * slope_u) & (slope_u * slope_u > epsilon * high)
+        exact = 0.5 * epsilon * dr.abs(mixed) / dr.select(small, slope_u, 1)
+        slope_v = dr.select(small, exact, slope_v)
+        length_u = taylor_length(slope_u, curvature(cos_t, sin_t, slope_u))
+        length_v = taylor_length(slope_v, curvature(-sin_t, cos_t, slope_v))
 
     u_d = t.e1 * cos_t + t.e2 * sin_t
     v_d = t.e2 * cos_t - t.e1 * sin_t  # r × u_d
@@ -104,12 +106,14 @@ def kernel_axes(lobe: ASG, r, epsilon=0.02, rule="taylor"):
 
 
 def _steep_direction(t, epsilon):
-    """(cos, sin) in (e1, e2) of the dominant eigenvector of g gᵀ + ε|H|/2, |H| the Hessian with
-    its eigenvalues made positive."""
+    """(cos, sin, uᵀ|H|v, ‖H‖): coordinates in (e1, e2) of the dominant eigenvector u of
+    g gᵀ + ε|H|/2, |H| the Hessian with its eigenvalues made positive; |H|'s mixed entry, v = r × u,
+    and its larger eigenvalue."""
     high, low, c, s = symmetric_eigen(t.h11, t.h12, t.h22)
     high, low = dr.abs(high), dr.abs(low)
+    difference, largest = high - low, dr.maximum(high, low)
     # All terms scaled by the largest entry, so that no square overflows.
-    size = dr.maximum(dr.maximum(dr.abs(t.g1), dr.abs(t.g2)), dr.sqrt(dr.maximum(high, low)))
+    size = dr.maximum(dr.maximum(dr.abs(t.g1), dr.abs(t.g2)), dr.sqrt(largest))
     inv = dr.rcp(dr.select(size > 0, size, 1))
     g1, g2 = t.g1 * inv, t.g2 * inv
     weight = 0.5 * epsilon * inv
@@ -118,7 +122,8 @@ def _steep_direction(t, epsilon):
     m12 = g1 * g2 + (high - low) * c * s
     m22 = g2 * g2 + high * s * s + low * c * c
     _, _, cos_t, sin_t = symmetric_eigen(m11, m12, m22)
-    return cos_t, sin_t
+    mixed = difference * (cos_t * c + sin_t * s) * (cos_t * s - sin_t * c)
+    return cos_t, sin_t, mixed, largest
 
 
 def _hypot(a, b):
@@ -214,24 +219,27 @@ def guarded_axes(
         )
 
     (u1, u2), (v1, v2) = project(u), project(v)
-    if not (guard or size == "epsilon"):
-        # Only the shape counts: scaled by the larger axis before squaring.
-        inv_size = dr.rcp(dr.maximum(dr.sqrt(u1 * u1 + u2 * u2 + v1 * v1 + v2 * v2), 1e-30))
-        u1, u2, v1, v2 = (w * inv_size for w in (u1, u2, v1, v2))
-    m11, m12, m22 = u1 * u1 + v1 * v1, u1 * u2 + v1 * v2, u2 * u2 + v2 * v2
-    if guard and size == "bandwidth":
-        disc2 = dr.square(GUARD_KAPPA * radius)
-        m11, m22 = m11 + disc2, m22 + disc2
+    disc_share = GUARD_KAPPA * radius if guard and size == "bandwidth" else mi.Float(0)
+    # Everything in units of the largest length, so that no square leaves the range of numbers.
+    unit = dr.maximum(dr.maximum(dr.hypot(u1, u2), dr.hypot(v1, v2)), disc_share)
+    unit = dr.maximum(unit, 1e-30)
+    u1, u2, v1, v2, disc_share = (w / unit for w in (u1, u2, v1, v2, disc_share))
 
-    # --- Half axes, aspect and size ---
-    long2, short2, cos_t, sin_t = symmetric_eigen(m11, m12, m22)
-    # |s × t|² is the determinant, without the cancellation in the smaller eigenvalue.
-    capped = short2 * (max_aspect * max_aspect) < long2
-    short2 = dr.maximum(short2, long2 / (max_aspect * max_aspect))
-    long, short = dr.sqrt(dr.maximum(long2, 1e-30)), dr.sqrt(dr.maximum(short2, 1e-30))
-    if size == "bandwidth":
-        aspect = dr.sqrt(long / short)
-        long, short = radius * aspect, radius / aspect
+    # --- Covariances add; half axes ---
+    m11, m12, m22 = u1 * u1 + v1 * v1, u1 * u2 + v1 * v2, u2 * u2 + v2 * v2
+    added = disc_share * disc_share
+    # The determinant from the cross product: the smaller eigenvalue itself is a difference.
+    cross = u1 * v2 - u2 * v1
+    determinant = cross * cross + added * (m11 + m22) + added * added
+    long2, _, cos_t, sin_t = symmetric_eigen(m11 + added, m12, m22 + added)
+
+    # --- Aspect and size: a cap keeps the area ---
+    area = dr.maximum(dr.sqrt(determinant), 1e-30)  # |s × t|
+    aspect = dr.maximum(long2 / area, 1)
+    capped = ~(aspect <= max_aspect)
+    mean = radius if size == "bandwidth" else unit * dr.sqrt(area)
+    stretch = dr.sqrt(dr.select(capped, max_aspect, aspect))
+    long, short = mean * stretch, mean / stretch
     s = (frame.s * cos_t + frame.t * sin_t) * long
     t = (frame.t * cos_t - frame.s * sin_t) * short
     return PlaneKernel(s, t, capped | grazing)

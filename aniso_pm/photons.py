@@ -91,7 +91,7 @@ def _packet():
 
 
 def encode_normal(n):
-    """Unit vector → 24 bits (octahedral, 12 bits a coordinate: within 0.05 degrees)."""
+    """Unit vector → 24 bits (octahedral, 12 bits a coordinate: within 0.07 degrees)."""
     n = n / (dr.abs(n.x) + dr.abs(n.y) + dr.abs(n.z))
     fold_x = dr.mulsign(1 - dr.abs(n.y), n.x)
     fold_y = dr.mulsign(1 - dr.abs(n.x), n.y)

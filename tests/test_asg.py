@@ -282,10 +282,15 @@ SAMPLED = [
 RADIAL, ANGULAR = 12, 24
 
 
+def raised(own, other):
+    """Bandwidth that ``sample`` uses: at least 1, or the other one if that is smaller still."""
+    return max(own, min(other, 1), 1e-6)
+
+
 def stretched(a, b, lam, mu):
     """Polar coordinates of (a√λ, b√µ): the angle in [0, 2π) and the radius as a share of the
     smaller of 4 (where exp(−16) is left) and the unit disc's rim in that direction."""
-    a1, b1 = np.sqrt(max(lam, 1e-6)), np.sqrt(max(mu, 1e-6))
+    a1, b1 = np.sqrt(raised(lam, mu)), np.sqrt(raised(mu, lam))
     p, q = a * a1, b * b1
     phi, rho = np.arctan2(q, p) % (2 * np.pi), np.hypot(p, q)
     return phi, rho / limit(phi, a1, b1)
@@ -299,7 +304,7 @@ def pdf_per_cell(lobe, nodes=8):
     """∫ pdf dω (dω = da db / v·z), the pdf by the module, in equal cells of ``stretched``
     coordinates, Gauss–Legendre nodes in each."""
     lam, mu = lobe.lam[0], lobe.mu[0]
-    a1, b1 = np.sqrt(max(lam, 1e-6)), np.sqrt(max(mu, 1e-6))
+    a1, b1 = np.sqrt(raised(lam, mu)), np.sqrt(raised(mu, lam))
     x, w = np.polynomial.legendre.leggauss(nodes)
 
     def points(n):
@@ -358,7 +363,7 @@ def test_sample_returns_unit_directions_and_the_pdf_at_them(lam, mu):
     # The exponent (up to 17) is evaluated at v rounded to 6e-8 of 1, σ = 1/√(2λ):
     # 2·√17·√λ·6e-8; 1e-7/0.02 for v·z; and the truncation 1 − exp(−ρ²max) depends on the angle of
     # (a, b) by √(µ/λ) at most, which is known to 1e-7/r.
-    low, high = sorted((max(lam, 1e-6), max(mu, 1e-6)))
+    low, high = sorted((raised(lam, mu), raised(mu, lam)))
     r = np.maximum(np.hypot(dot(arr(v), lobe.x), dot(arr(v), lobe.y)), 1e-7)
     turning = 4e-7 * np.sqrt(high / low) / r if low < 20 else 0
     assert np.all((error < 2e-5 + 8e-7 * np.sqrt(high) + turning)[front])
