@@ -102,7 +102,8 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
     """Trace camera paths to their gather points: (radiance, valid, GatherPoints).
 
     radiance       emission, direct light and light of paths without a receiver, W/m²/sr.
-    valid          did the camera ray meet a surface? (alpha)
+    valid          did the ray meet anything but null surfaces and, if they are hidden, emitters?
+                   (alpha, as in ``path``)
     follow_lobes   keep the anisotropic lobe of the last glossy vertex (``needs.lobes``).
     deep           the scene has surfaces to walk through (``needs.chains``).
     """
@@ -115,7 +116,7 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
     β = mi.Spectrum(1)  # Path throughput
     η = mi.Float(1)  # Relative index of refraction along the path
     active = mi.Bool(active)  # Lanes with a path to follow
-    valid = mi.Bool(False)  # Did the first segment end on a surface?
+    valid = mi.Bool(not hide_emitters and scene.environment() is not None)  # Anything seen?
     gathered = mi.Bool(False)  # The last vertex was a receiver: only its direct light is missing
     si_prev = dr.zeros(mi.Interaction3f)  # Last vertex
     pdf_prev = mi.Float(1)  # Density of the last BSDF sample
@@ -136,7 +137,6 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
         first = depth == 1
         if dr.hint(hide_emitters, mode="scalar"):
             si = _skip_emitters(scene, ray, si, active & first)
-        valid |= active & first & si.is_valid()
 
         # --- Emission, weighted against emitter sampling at the last vertex ---
         ds = mi.DirectionSample3f(scene, si, si_prev)
@@ -146,6 +146,7 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
         pdf_emitter = scene.pdf_emitter_direction(si_prev, ds, seen & ~delta_prev)
         mis = dr.select(delta_prev, 1, _power_heuristic(pdf_prev, pdf_emitter))
         L[seen] = dr.fma(β, mis * ds.emitter.eval(si, seen), L)
+        on_surface = active & si.is_valid()
         active &= si.is_valid() & (depth < max_depth) & ~gathered
 
         # --- Direct light by emitter sampling ---
@@ -175,6 +176,7 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
         if dr.hint(follow_lobes, mode="scalar"):
             path = _follow(path, bsdf, si, ray, bs, active & ~gathered)
+        valid |= on_surface & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         ray = si.spawn_ray(si.to_world(bs.wo))
         β *= weight
         η *= bs.eta

@@ -1,0 +1,164 @@
+"""Indirect light against converged ``path``, in the mean over the image and over each region.
+
+The reference values (tests/rooms.json) are made by ``python tests/energy.py``; their standard
+errors are far below those of the renders here.
+"""
+
+import json
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from energy import REFERENCE, region_means
+from rooms import ROOMS
+
+# Small against the room (2 units): kernel blur moves light by less than the tolerance.
+PHOTON_MAPPER = {"type": "aniso_pm", "initial_radius": 0.01, "alpha": 1.0}
+KERNELS = {
+    "isotropic": {"kernel": "isotropic"},
+    "lobe": {"rule": "lobe"},
+    "taylor": {"rule": "taylor"},
+    "paper": {"rule": "paper"},
+    "paper-unguarded": {"rule": "paper", "guard": False},
+    "epsilon-sized": {"rule": "taylor", "size": "epsilon", "epsilon": 0.5},
+}
+
+
+@pytest.fixture(autouse=True)
+def _variant(variant_llvm_rgb):
+    pass
+
+
+def assert_agrees(room, kernel, max_depth, photon_count, passes, spp, seeds, tolerance):
+    """Every region's mean within ``tolerance`` of the reference, allowing for three standard
+    errors of the render, which must themselves be small enough to mean something."""
+    scene = mi.load_dict(ROOMS[room]())
+    integrator = PHOTON_MAPPER | KERNELS[kernel] | {"photon_count": photon_count, "passes": passes}
+    expected = json.loads(REFERENCE.read_text())[room][str(max_depth)]
+    found = region_means(scene, integrator, max_depth, spp, seeds)
+    report = []
+    for name, (mean, error) in found.items():
+        reference, reference_error = expected[name]
+        if reference < 1e-3:
+            assert mean == pytest.approx(reference, abs=2e-3)
+            continue
+        ratio, sigma = mean / reference, math.hypot(error, reference_error) / reference
+        report.append(f"{name}: {ratio:.4f} ± {sigma:.4f}")
+        assert sigma < tolerance, report
+        assert abs(ratio - 1) < tolerance + 3 * sigma, report
+    print(room, kernel, max_depth, "; ".join(report))
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_indirect_light_agrees_with_path(room):
+    # The glass ball mirrors the light itself: a small bright spot that only eye paths resolve.
+    spp = 512 if room == "ball" else 32
+    assert_agrees(room, "lobe", -1, 200_000, 4, spp, range(3), 0.015)
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3, 4])
+def test_max_depth_means_what_it_means_to_path(depth):
+    assert_agrees("plate", "lobe", depth, 200_000, 2, 32, range(3), 0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("room", ROOMS)
+def test_indirect_light_agrees_with_path_within_one_percent(room, kernel):
+    if room != "plate" and kernel not in ("isotropic", "lobe"):
+        pytest.skip("nothing anisotropic in this room: the same kernels as with isotropic")
+    spp = 4096 if room == "ball" else 512
+    assert_agrees(room, kernel, -1, 400_000, 16, spp, range(6), 0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", [1, 2, 3, 4, 5, 6])
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_max_depth_agrees_within_one_percent(room, depth):
+    spp = 2048 if room == "ball" else 256
+    assert_agrees(room, "lobe", depth, 400_000, 8, spp, range(6), 0.01)
+
+
+# --- Closed forms: no reference needed, no noise to speak of ---
+
+
+def furnace(edge_compensation, albedo=0.5, radius=0.2):
+    """Inside a cube that emits radiance 1 and reflects ``albedo``, every ray sees
+    1/(1 − albedo), in its corners too."""
+    T = mi.ScalarTransform4f
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {
+                "type": "aniso_pm",
+                "initial_radius": radius,
+                "photon_count": 200_000,
+                "edge_compensation": edge_compensation,
+            },
+            "sensor": {
+                "type": "perspective",
+                "fov": 80,
+                "to_world": T().look_at(origin=[-0.9, -0.8, -0.7], target=[1, 1, 1], up=[0, 1, 0]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 32,
+                    "height": 32,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                },
+            },
+            "box": {
+                "type": "cube",
+                "flip_normals": True,
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}},
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
+            },
+        }
+    )
+
+
+def test_a_furnace_is_uniform_up_to_its_edges():
+    image = np.array(mi.render(furnace(True), spp=64))
+    assert image.mean() == pytest.approx(2, rel=0.01)
+    # The camera looks into a corner: without compensation its pixels lose up to 3/4 of the
+    # indirect half. What is left is the noise of some 100 photons a kernel, the same in all
+    # samples of a pixel.
+    assert image.min() > 1.8 and image.max() < 2.25
+
+
+def test_edges_are_dark_without_compensation():
+    """Spilling over one straight edge leaves Φ(x√2/r) of the light: the test above can fail."""
+    image = np.array(mi.render(furnace(False), spp=64))
+    assert image.mean() < 1.975
+    assert image.min() < 1.75
+
+
+def test_kernel_normalisation_is_exact_on_a_curved_surface():
+    """Inside an emitting sphere: no edges, but the surface bends away from every kernel."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "aniso_pm", "initial_radius": 0.05, "photon_count": 300_000},
+            "sensor": {
+                "type": "perspective",
+                "fov": 60,
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 24,
+                    "height": 24,
+                    "component_format": "float32",
+                },
+            },
+            "ball": {
+                "type": "sphere",
+                "flip_normals": True,
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
+            },
+        }
+    )
+    image = mi.render(scene, spp=64)
+    # 3e5 photons of equal flux over the sphere: 0.3 % in the mean over the part that is seen.
+    assert np.array(image).mean() == pytest.approx(2, rel=0.01)

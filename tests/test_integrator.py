@@ -1,0 +1,379 @@
+"""Mitsuba's render() contract, the parameters, and switching variants."""
+
+import aniso_pm  # noqa: F401
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from rooms import room, room_with_plate
+
+SMALL = {"type": "aniso_pm", "photon_count": 5000, "initial_radius": 0.1}
+
+
+@pytest.fixture
+def rgb(variant_llvm_rgb):
+    pass
+
+
+@pytest.fixture
+def scene(rgb):
+    return mi.load_dict(room_with_plate(16))
+
+
+def integrator(**parameters):
+    return mi.load_dict(SMALL | parameters)
+
+
+def array(image):
+    return np.array(image, dtype=np.float64)
+
+
+# --- render() ---
+
+
+def test_sensor_may_be_an_index_or_an_object_and_seed_an_int_or_an_array(scene):
+    plugin = integrator()
+    first = array(plugin.render(scene, sensor=0, seed=3, spp=4))
+    second = array(plugin.render(scene, scene.sensors()[0], mi.UInt32(3), 4))
+    # The order in which threads store photons changes the order of float sums.
+    np.testing.assert_allclose(first, second, rtol=1e-3, atol=1e-4)
+
+
+def test_the_seed_decides(scene):
+    plugin = integrator()
+    images = [array(mi.render(scene, integrator=plugin, spp=4, seed=s)) for s in (1, 1, 2)]
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-3, atol=1e-4)
+    assert np.abs(images[0] - images[2]).max() > 1e-2
+
+
+def test_every_pixel_is_finite_and_lit(scene):
+    image = array(mi.render(scene, integrator=integrator(), spp=16))
+    assert image.shape == (16, 16, 3)
+    assert np.isfinite(image).all() and image.min() > 0
+
+
+def test_spp_is_read_back_from_samplers_that_round_it(rgb):
+    definition = room(size=8)
+    definition["sensor"]["sampler"] = {"type": "multijitter"}
+    plugin = integrator()
+    image = mi.render(mi.load_dict(definition), integrator=plugin, spp=5)
+    assert plugin.statistics["spp"] == 6
+    assert plugin.statistics["eye_samples"] == 6 * 64
+    assert np.isfinite(array(image)).all()
+
+
+def test_spp_is_shared_by_the_passes_and_none_is_lost(scene):
+    plugin = integrator(passes=4)
+    mi.render(scene, integrator=plugin, spp=10)
+    assert plugin.statistics["spp"] == 10
+    assert plugin.statistics["passes"] == 4
+    assert plugin.statistics["photons_emitted"] == 4 * 5000
+
+
+def test_fewer_samples_than_passes_are_refused_with_the_remedy(scene):
+    with pytest.raises(ValueError, match="raise the sample count to 8"):
+        integrator(passes=8).render(scene, spp=4)
+
+
+def test_develop_false_leaves_the_picture_in_the_film(scene):
+    plugin = integrator()
+    nothing = plugin.render(scene, spp=4, develop=False, evaluate=False)
+    assert dr.width(nothing) == 0
+    image = array(mi.TensorXf(scene.sensors()[0].film().bitmap()))
+    expected = array(plugin.render(scene, spp=4))
+    np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "mitchell", "lanczos"])
+@pytest.mark.parametrize("border", [False, True])
+def test_reconstruction_filters_agree_with_path(rgb, rfilter, border):
+    """In an empty box lit by its own walls path and photon mapper see the same radiance."""
+    definition = room(size=12)
+    definition["sensor"]["film"] |= {"rfilter": {"type": rfilter}, "sample_border": border}
+    scene = mi.load_dict(definition)
+    ours = array(mi.render(scene, integrator=integrator(photon_count=50_000), spp=64))
+    path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=64))
+    assert ours.shape == path.shape
+    assert ours.mean() == pytest.approx(path.mean(), rel=0.05)
+    # Pixel by pixel: a shift of the image by one pixel would show at the edges of the walls.
+    assert np.abs(ours - path).mean() < 0.08 * path.mean()
+
+
+def test_crop_window_is_that_part_of_the_picture(rgb):
+    definition = room(size=16)
+    whole = array(mi.render(mi.load_dict(definition), integrator=integrator(), spp=256))
+    definition["sensor"]["film"] |= {
+        "crop_width": 8,
+        "crop_height": 6,
+        "crop_offset_x": 5,
+        "crop_offset_y": 7,
+    }
+    part = array(mi.render(mi.load_dict(definition), integrator=integrator(), spp=256))
+    assert part.shape == (6, 8, 3)
+    np.testing.assert_allclose(part.mean((0, 1)), whole[7:13, 5:13].mean((0, 1)), rtol=0.05)
+
+
+@pytest.mark.parametrize("hide", [False, True])
+def test_alpha_and_hidden_emitters_are_those_of_path(rgb, hide):
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 16,
+                    "height": 16,
+                    "pixel_format": "rgba",
+                    "rfilter": {"type": "box"},
+                },
+            },
+            "sky": {"type": "constant", "radiance": 0.5},
+            "lamp": {
+                "type": "sphere",
+                "center": [0, 0, 5],
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 2.0}},
+            },
+            "wall": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([-2, 0, 8]).rotate([0, 1, 0], 180),
+            },
+        }
+    )
+    ours = array(mi.render(scene, integrator=integrator(hide_emitters=hide), spp=256))
+    path = mi.load_dict({"type": "path", "hide_emitters": hide})
+    path = array(mi.render(scene, integrator=path, spp=256))
+    # 256 samples: standard error of a pixel's coverage at most 3 %, of its radiance 5 %.
+    np.testing.assert_allclose(ours[..., 3], path[..., 3], atol=0.15)
+    np.testing.assert_allclose(ours[..., 3].mean(), path[..., 3].mean(), atol=0.01)
+    np.testing.assert_allclose(ours[..., :3].mean(), path[..., :3].mean(), rtol=0.03)
+
+
+def test_inside_aov_it_renders_the_same_picture(scene):
+    plain = array(mi.render(scene, integrator=integrator(), spp=64))
+    outer = mi.load_dict({"type": "aov", "aovs": "d:depth", "image": SMALL})
+    image = array(mi.render(scene, integrator=outer, spp=64))
+    assert image.shape[2] == plain.shape[2] + 1
+    np.testing.assert_allclose(image[..., :3].mean(), plain.mean(), rtol=0.05)
+
+
+def test_isotropic_and_anisotropic_are_the_same_where_nothing_is_anisotropic(rgb):
+    scene = mi.load_dict(room(size=8))
+    images = [
+        array(mi.render(scene, integrator=integrator(kernel=k), spp=4))
+        for k in ("isotropic", "anisotropic")
+    ]
+    np.testing.assert_allclose(*images, rtol=1e-3, atol=1e-4)
+
+
+def test_statistics_count_what_happened(scene):
+    plugin = integrator(photon_count=20_000)
+    mi.render(scene, integrator=plugin, spp=4)
+    s = plugin.statistics
+    assert s["eye_samples"] == 4 * 256
+    assert 0 < s["gather_points_anisotropic"] < s["gather_points"] <= s["eye_samples"]
+    assert s["photons_stored"] > s["photons_emitted"] == 20_000
+    assert s["photons_rejected"] == s["eye_samples_rejected"] == 0
+    assert set(s["seconds"]) == {"pilot", "photons", "eye", "gather", "film"}
+
+
+def test_progress_is_reported_after_every_pass(scene):
+    calls = []
+    plugin = integrator(passes=3)
+    plugin.progress = lambda done, total, text: calls.append((done, total))
+    mi.render(scene, integrator=plugin, spp=3)
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_interruption_keeps_the_passes_so_far(scene):
+    plugin = integrator(passes=3)
+
+    def interrupt(done, total, text):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    plugin.progress = interrupt
+    image = array(plugin.render(scene, spp=3))
+    assert plugin.statistics["interrupted"] and plugin.statistics["passes"] == 2
+    assert np.isfinite(image).all() and image.mean() > 0
+
+
+def test_automatic_radius_scales_with_the_scene_and_the_photons(rgb):
+    """Sixty photons a kernel, whatever the unit of length; √2 smaller with twice the photons."""
+    radii = {}
+    for scale in (1, 100):
+        T = mi.ScalarTransform4f
+        definition = room(size=16)
+        for name, part in definition.items():
+            if isinstance(part, dict) and "to_world" in part:
+                if name == "sensor":
+                    part["to_world"] = T().look_at(
+                        origin=[0, 0, 0.97 * scale], target=[0, -0.15 * scale, 0], up=[0, 1, 0]
+                    )
+                else:
+                    part["to_world"] = T().scale(scale) @ part["to_world"]
+        scene = mi.load_dict(definition)
+        for count in (50_000, 100_000):
+            plugin = integrator(initial_radius=0.0, photon_count=count)
+            mi.render(scene, integrator=plugin, spp=4)
+            radii[scale, count] = plugin.statistics["initial_radius"]
+            s = plugin.statistics
+            assert 30 < s["photons_gathered"] / s["gather_points"] < 120
+    assert radii[100, 50_000] == pytest.approx(100 * radii[1, 50_000], rel=0.1)
+    assert radii[1, 100_000] == pytest.approx(radii[1, 50_000] / 2**0.5, rel=0.1)
+
+
+# --- Scenes with little in them ---
+
+
+def test_a_scene_without_emitters_is_black(rgb):
+    definition = room(size=8)
+    del definition["light"]["emitter"]
+    assert array(mi.render(mi.load_dict(definition), integrator=integrator(), spp=4)).max() == 0
+
+
+def test_a_scene_without_receivers_is_path_traced(rgb):
+    definition = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+        "sky": {"type": "constant"},
+        "ball": {"type": "sphere", "center": [0, 0, 4], "bsdf": {"type": "roughconductor"}},
+    }
+    scene = mi.load_dict(definition)
+    plugin = integrator(initial_radius=0.0)
+    image = array(mi.render(scene, integrator=plugin, spp=256))
+    path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=256))
+    np.testing.assert_allclose(image.mean(), path.mean(), rtol=0.01)
+    assert plugin.statistics["photons_emitted"] == 0
+
+
+def test_media_are_refused_with_one_sentence(rgb):
+    definition = room(size=8)
+    definition["fog"] = {
+        "type": "sphere",
+        "radius": 0.3,
+        "bsdf": {"type": "null"},
+        "interior": {"type": "homogeneous"},
+    }
+    scene = mi.load_dict(definition)
+    with pytest.raises(ValueError, match='shape "fog" bounds a participating medium'):
+        integrator().render(scene, spp=1)
+
+
+def test_derivatives_are_refused_with_one_sentence(scene):
+    plugin = integrator()
+    with pytest.raises(Exception, match="derivatives are not supported"):
+        plugin.render_backward(scene, None, None)
+    with pytest.raises(Exception, match="derivatives are not supported"):
+        plugin.render_forward(scene, None)
+
+
+# --- Parameters ---
+
+
+@pytest.mark.parametrize(
+    "name, value, word",
+    [
+        ("kernel", "round", "anisotropic, isotropic"),
+        ("rule", "best", "taylor, paper, lobe"),
+        ("size", "huge", "bandwidth, epsilon"),
+        ("epsilon", 0.0, "between"),
+        ("epsilon", float("nan"), "between"),
+        ("max_aspect", 0.5, "between"),
+        ("photon_count", 0, "between"),
+        ("photon_count", -5, "between"),
+        ("photon_count", 1.5, "integer"),
+        ("photon_count", "many", "integer"),
+        ("passes", 0, "between"),
+        ("alpha", 0.0, "above 0"),
+        ("alpha", 1.5, "at most 1"),
+        ("initial_radius", -1.0, "positive"),
+        ("initial_radius", float("inf"), "positive"),
+        ("max_depth", 0, "unlimited"),
+        ("max_depth", -2, "unlimited"),
+        ("rr_depth", 0, "between"),
+        ("guard", 1, "boolean"),
+        ("guard", "true", "boolean"),
+    ],
+)
+def test_wrong_parameters_are_refused_by_name_value_and_range(rgb, name, value, word):
+    with pytest.raises(Exception) as caught:
+        mi.load_dict({"type": "aniso_pm", name: value})
+    text = str(caught.value)
+    assert "aniso_pm" in text and f'"{name}"' in text and word in text
+
+
+def test_unknown_parameters_are_reported(rgb):
+    with pytest.raises(Exception, match="photons_count"):
+        mi.load_dict({"type": "aniso_pm", "photons_count": 5})
+
+
+def test_parameters_round_trip(rgb):
+    plugin = integrator(rule="taylor", passes=7, hide_emitters=True)
+    values = plugin.parameters()
+    assert (values["rule"], values["passes"], values["hide_emitters"]) == ("taylor", 7, True)
+    again = mi.load_dict({"type": "aniso_pm"} | values)
+    assert again.parameters() == values
+
+
+def test_integers_serve_as_floats(rgb):
+    assert integrator(initial_radius=1).parameters()["initial_radius"] == 1.0
+
+
+# --- Variants ---
+
+
+def test_mono_sees_the_luminance_of_grey_scenes(variant_llvm_mono):
+    definition = room(size=16)
+    scene = mi.load_dict(definition)
+    image = array(mi.render(scene, integrator=integrator(photon_count=50_000), spp=64))
+    path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=256))
+    assert image.mean() == pytest.approx(path.mean(), rel=0.03)
+
+
+def test_spectral_is_refused_with_one_sentence(variant_llvm_spectral):
+    scene = mi.load_dict(room(size=4))
+    with pytest.raises(ValueError, match='variant "llvm_ad_spectral" is not supported'):
+        integrator().render(scene, spp=1)
+
+
+def test_scalar_variants_are_refused_at_loading():
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    try:
+        with pytest.raises(Exception, match='the variant "scalar_rgb" has no'):
+            mi.load_dict({"type": "aniso_pm"})
+    finally:
+        mi.set_variant(before or "llvm_ad_rgb")
+
+
+def test_switching_variants_there_and_back_changes_nothing():
+    before = mi.variant()
+    images = []
+    for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_rgb"):
+        mi.set_variant(variant)
+        assert type(mi.load_dict(SMALL)).__name__ == "AnisoPhotonMapper"
+        assert type(mi.load_dict({"type": "asgconductor"})).__name__ == "ASGConductor"
+        if variant == "llvm_ad_rgb":
+            scene = mi.load_dict(room_with_plate(8))
+            images.append(array(mi.render(scene, integrator=integrator(), spp=4)))
+    mi.set_variant(before or "llvm_ad_rgb")
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-3, atol=1e-4)
+
+
+def test_it_loads_from_xml(rgb):
+    scene = mi.load_string(
+        """<scene version="3.0.0">
+             <integrator type="aniso_pm">
+               <string name="kernel" value="isotropic"/>
+               <integer name="photon_count" value="1234"/>
+               <float name="initial_radius" value="0.5"/>
+             </integrator>
+             <shape type="sphere"><bsdf type="asgconductor">
+               <string name="material" value="Al"/>
+               <float name="alpha_u" value="0.1"/><float name="alpha_v" value="0.3"/>
+             </bsdf></shape>
+           </scene>"""
+    )
+    values = scene.integrator().parameters()
+    assert values["photon_count"] == 1234 and values["kernel"] == "isotropic"
