@@ -45,6 +45,11 @@ def read_scene(scene) -> Needs:
                 f'aniso_pm: shape "{name}" bounds a participating medium, which this integrator '
                 'does not support; remove the medium or use the integrator "volpath"'
             )
+        if shape.class_name() == "Instance":
+            # Its shapes cannot be reached from Python: anything may be among them.
+            for need in (needs.lobes, needs.chains, needs.receivers):
+                need.append(f"{name}: Instance")
+            continue
         bsdf = shape.bsdf()
         if bsdf is None or bsdf.ptr in seen:
             continue

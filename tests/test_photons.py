@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-
 from aniso_pm import photons
 
 ALBEDO = 0.5
