@@ -1,7 +1,7 @@
 """Render the pictures of the README and the references they are compared with.
 
-``python scenes/make_pictures.py references [--spp N]`` renders both scenes with Mitsuba's ``path``
-into ``scenes/references`` (half an hour at the default); ``python scenes/make_pictures.py pictures``
+``python scenes/make_pictures.py references [--spp N]`` renders both scenes with ``path`` into
+``scenes/references`` (half an hour at the default); ``python scenes/make_pictures.py pictures``
 renders them with ``aniso_pm``, compares, prints a table and writes ``scenes/pictures``. Needs
 matplotlib, which the extra ``dev`` brings.
 """
@@ -27,7 +27,7 @@ def render(scene, integrator, spp, seed):
 
 def make_reference(name, spp):
     """Two independent halves, kept in one file: their difference is the reference's own noise."""
-    scene = mi.load_file(str(HERE / f"{name}.xml"), integrator="path")
+    scene = mi.load_file(str(HERE / f"{name}.xml"))
     halves = [0.0, 0.0]
     waves = max(2, 2 * (spp // (2 * WAVE)))
     for i in range(waves):
