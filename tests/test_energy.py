@@ -22,7 +22,7 @@ KERNELS = {
     "taylor": {"rule": "taylor"},
     "paper": {"rule": "paper"},
     "paper-unguarded": {"rule": "paper", "guard": False},
-    "epsilon-sized": {"rule": "taylor", "size": "epsilon", "epsilon": 0.5},
+    "epsilon-sized": {"rule": "taylor", "size": "epsilon"},
 }
 
 
