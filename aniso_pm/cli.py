@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Iterator
@@ -129,7 +130,10 @@ def render(
         if passes is not None:
             if not hasattr(integrator, "passes"):
                 raise InputError(f"--passes: {integrator.class_name()} renders in one pass only")
-            integrator.passes = passes
+            try:
+                integrator.passes = passes
+            except ValueError as error:
+                raise InputError(one_line(error)) from error
 
         # --- Render ---
         statistics = _render(world, camera, integrator, seed, spp, quiet)
@@ -239,7 +243,8 @@ def _record(integrator, statistics: dict[str, Any], camera) -> dict[str, Any]:
     in_python = not kind.__module__.startswith("mitsuba")
     return {
         "integrator": kind.__name__ if in_python else integrator.class_name(),
-        "spp": camera.sampler().sample_count(),  # samplers may round what was asked for
+        # Samplers may round what was asked for.
+        "spp": statistics.get("spp", camera.sampler().sample_count()),
         "size": [int(pixels) for pixels in camera.film().size()],
         "parameters": integrator.parameters() if hasattr(integrator, "parameters") else {},
         "statistics": statistics,
@@ -257,8 +262,8 @@ def _progress_bar(integrator, quiet: bool) -> Iterator[None]:
 
     with tqdm(file=sys.stderr, leave=False, dynamic_ncols=True) as bar:
 
-        def show(done: int, total: int, text: str) -> None:
-            bar.total, bar.n = total, done
+        def show(done: float, total: int, text: str) -> None:
+            bar.total, bar.n = total, round(done, 2)
             bar.set_postfix_str(text)
 
         integrator.progress = show
@@ -277,6 +282,9 @@ def _mitsuba_log(quiet: bool) -> Iterator[None]:
         def append(self, level, text) -> None:
             if level >= mi.LogLevel.Warn and not quiet:
                 message = text.partition(" WARN ")[2] or text
+                message = re.sub(
+                    r"^\s*(\[[^]]*\]\s*)?\w+\(\): ", "", message
+                )  # where it was logged
                 print(f"aniso-pm: warning: {one_line(message.strip())}", file=sys.stderr)
 
         def log_progress(self, *_) -> None:

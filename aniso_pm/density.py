@@ -9,8 +9,10 @@ surface: |d·n| within half a bandwidth and normals within 41 degrees (cosine 0.
 
 m is the share of the kernel that lies on such a surface. Without it every estimate near an edge
 loses what its kernel spills over the edge. Points drawn from the kernel are probed by short rays
-along −n until the first one lands; the number of rays is geometrically distributed with mean 1/m,
-so it *is* an unbiased estimate of 1/m, at the price of one ray wherever the kernel spills nothing.
+along −n until the first one lands on a receiver; the number of rays is geometrically distributed
+with mean 1/m, so it *is* an estimate of 1/m, unbiased but for the end after PROBES_MAX rays, at the
+price of one ray wherever the kernel spills nothing. A surface that goes on behind a wall counts as
+well: there the estimate stays as dark as without compensation.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import mitsuba as mi
 from . import index as spatial
 from .eye import GatherPoints
 from .kernel import PlaneKernel, disc, guarded_axes
+from .needs import receiver_reflectance
 from .photons import PhotonMap, decode_normal, photon_flux, segments
 
 CUT2 = 4.0
@@ -46,6 +49,24 @@ class KernelOptions:
     epsilon: float
     guard: bool
     max_aspect: float
+
+
+@dataclass
+class Gathered:
+    """What density estimation found, one lane a gather point.
+
+    radiance  reflected radiance, W/m²/sr.
+    photons   photons inside the kernel.
+    follows   the kernel follows a lobe (else it is the disc).
+    bounded   the lobe's kernel met the aspect cap or the grazing clamp.
+    lost      no part of the kernel was found to lie on a receiver.
+    """
+
+    radiance: Any
+    photons: Any
+    follows: Any
+    bounded: Any
+    lost: Any
 
 
 def kernels(points: GatherPoints, radius, options: KernelOptions) -> tuple[PlaneKernel, Any]:
@@ -103,21 +124,28 @@ def estimate(
 
 @dr.syntax
 def probe_surface(scene, sampler, points: GatherPoints, kernel: PlaneKernel, radius, active):
-    """Unbiased estimate of 1/m, the inverse share of each kernel that lies on the surface."""
+    """(1/m, nothing found?): the inverse share of each kernel that lies on a receiver.
+
+    1 where none of PROBES_MAX points lay on one, which says more about the surface (finer than
+    the slab, or than the resolution of its coordinates) than about its edges.
+    """
     n = mi.Vector3f(points.n)
     height = SLAB * radius
     tries = mi.UInt32(0)
-    active = mi.Bool(active)
-    while active:
+    landed = mi.Bool(False)
+    probing = mi.Bool(active)
+    while probing:
         tries += 1
-        u = sampler.next_2d(active)
+        u = sampler.next_2d(probing)
         sin_phi, cos_phi = dr.sincos(dr.two_pi * u.y)
         rho = dr.sqrt(-dr.log(1 - u.x * KERNEL_MASS))
         q = points.p + kernel.s * (rho * cos_phi) + kernel.t * (rho * sin_phi)
         probe = mi.Ray3f(q + n * height, -n)
         probe.maxt = 2 * height
-        hit = scene.ray_intersect(probe, mi.RayFlags.Minimal, False, active)
-        facing = dr.abs(dr.dot(hit.n, n)) > NORMAL_COS
-        landed = hit.is_valid() & facing
-        active &= ~landed & (tries < PROBES_MAX)
-    return dr.maximum(mi.Float(tries), 1)
+        si = scene.ray_intersect(probe, probing)
+        is_receiver, reflectance = receiver_reflectance(si.bsdf(), si, probing)
+        on_surface = si.is_valid() & is_receiver & (dr.max(reflectance) > 0)
+        on_surface &= dr.abs(dr.dot(si.n, n)) > NORMAL_COS
+        landed |= probing & on_surface
+        probing &= ~on_surface & (tries < PROBES_MAX)
+    return dr.select(landed, mi.Float(tries), 1), active & ~landed

@@ -69,34 +69,6 @@ def take_lanes(value, lanes):
     return value if dr.width(value) == 1 else dr.gather(type(value), value, lanes)
 
 
-def sample_rays(sensor, film, sampler, spp):
-    """Camera rays of one wavefront: (ray, weight, position on the film), spp samples a pixel in
-    consecutive lanes, the film's crop window and border included."""
-    size = mi.ScalarVector2u(film.crop_size())
-    border = film.rfilter().border_size() if film.sample_border() else 0
-    size += 2 * border
-    lane = dr.arange(mi.UInt32, size.x * size.y * spp)
-    pixel = lane // dr.opaque(mi.UInt32, spp)
-    row = pixel // size.x
-    corner = mi.Point2i(mi.Int32(pixel - row * size.x), mi.Int32(row)) - border
-    corner += mi.Point2i(mi.ScalarPoint2i(film.crop_offset()))
-
-    position = mi.Point2f(corner) + sampler.next_2d()
-    scale = mi.ScalarVector2f(1 / film.crop_size().x, 1 / film.crop_size().y)
-    normalised = (position - mi.ScalarPoint2f(film.crop_offset())) * scale
-    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    time = mi.Float(sensor.shutter_open())
-    if sensor.shutter_open_time() > 0:
-        time += sampler.next_1d() * sensor.shutter_open_time()
-    wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
-    ray, weight = sensor.sample_ray_differential(time, wavelength, normalised, aperture)
-    # Mitsuba's own integrators do the same: a ray covers 1/√spp of a pixel.
-    ray.scale_differential(dr.rsqrt(mi.ScalarFloat(spp)))
-    # With a box filter the offset within the pixel only adds rounding errors at pixel borders.
-    splat = mi.Point2f(corner) if film.rfilter().is_box_filter() else position
-    return ray, weight, splat
-
-
 @dr.syntax
 def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, deep, active):
     """Trace camera paths to their gather points: (radiance, valid, GatherPoints).
@@ -142,7 +114,8 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
         ds = mi.DirectionSample3f(scene, si, si_prev)
         seen = active & (ds.emitter != None)  # noqa: E711 (a Dr.Jit comparison)
         if dr.hint(hide_emitters, mode="scalar"):
-            seen &= ~(first & ~si.is_valid())
+            # As path does: the environment appears once a surface has been seen.
+            seen &= valid | si.is_valid()
         pdf_emitter = scene.pdf_emitter_direction(si_prev, ds, seen & ~delta_prev)
         mis = dr.select(delta_prev, 1, _power_heuristic(pdf_prev, pdf_emitter))
         L[seen] = dr.fma(β, mis * ds.emitter.eval(si, seen), L)
@@ -195,7 +168,8 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
             β[roulette] = β * dr.rcp(survive)
         depth += 1
 
-    points.active &= dr.all(dr.isfinite(points.weight))
+    # A throughput that is not finite makes the whole sample so: it is counted and dropped later.
+    L = dr.select(dr.all(dr.isfinite(points.weight)), L, dr.nan)
     return L, valid, points
 
 

@@ -127,7 +127,7 @@ def read_roughness(bsdf, si, active):
     is none to be read. bsdf: mi.BSDFPtr. Decided once per BSDF while tracing, not per lane."""
 
     def read(instance, si, active):
-        source = roughness_source(instance)
+        source = roughness_source(instance) if instance is not None else None
         if source is None:
             return mi.Float(0), mi.Float(0)
         alpha_u, alpha_v = source(si, active)

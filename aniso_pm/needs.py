@@ -33,10 +33,16 @@ class Needs:
 def read_scene(scene) -> Needs:
     """Inspect all BSDFs of a scene.
 
-    Raises ValueError naming the shape where the scene has participating media, which this
-    integrator does not support.
+    Raises ValueError naming the shape where the scene has participating media, or the emitter
+    where it has light that emitter sampling cannot find; neither is supported.
     """
     needs = Needs()
+    for emitter in scene.emitters():
+        if emitter.class_name() == "DirectionalArea":
+            raise ValueError(
+                f'aniso_pm: emitter "{emitter.id()}" is a directionalarea light, whose direct '
+                'light cannot be sampled from the eye; use "directional", "spot" or "area" instead'
+            )
     seen = set()
     for shape in scene.shapes():
         name = shape.id() or shape.class_name()
@@ -91,7 +97,7 @@ def receiver_reflectance(bsdf, si, active):
     """
 
     def read(instance, si, active):
-        if not is_lambertian(instance):
+        if instance is None or not is_lambertian(instance):  # None: a scene without shapes
             return mi.Bool(False), mi.Spectrum(0)
         up = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), mi.Frame3f.cos_theta(si.wi)))
         return mi.Bool(True), instance.eval(mi.BSDFContext(), si, up, active)

@@ -38,7 +38,7 @@ class PhotonMap:
 
     emitted    light paths traced: the estimate divides by it.
     stored     photons in the map; 0 means that ``index`` and ``flux`` are None.
-    rejected   light paths that ended because their flux was not finite.
+    rejected   fluxes that were not finite and were dropped: photons, and light paths that end.
     index      word of a point: octahedral normal in 24 bits, number of path segments in 8.
     flux       W, interleaved channels, padded to a power of two.
     """
@@ -172,7 +172,7 @@ def _trace_wavefront(
         active &= si.is_valid()
         bsdf = si.bsdf()
         wi_n, wi_s = dr.abs(dr.dot(ray.d, si.n)), dr.abs(mi.Frame3f.cos_theta(si.wi))
-        # Shading and geometric normal disagree about the side: the path ends (no light leaks).
+        # Where shading and geometric normal disagree about the side nothing is stored (no leaks).
         same_side = (dr.dot(-ray.d, si.n) * mi.Frame3f.cos_theta(si.wi)) > 0
 
         # --- Leave a photon ---
@@ -192,11 +192,10 @@ def _trace_wavefront(
         dr.scatter(flux, _pack(power), slot, deposit)
 
         # --- Scatter ---
-        active &= same_side & (depth < max_depth)
+        active &= depth < max_depth
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
         wo = si.to_world(bs.wo)
         wo_n, wo_s = dr.dot(wo, si.n), mi.Frame3f.cos_theta(bs.wo)
-        active &= wo_n * wo_s > 0
         correction = dr.abs((wi_s * wo_n) / (wo_s * wi_n))
         β *= weight * correction
         η *= bs.eta

@@ -48,7 +48,7 @@ class Settings:
         self._one_of("size", "bandwidth", "epsilon")
         self._between("epsilon", 1e-8, 10)
         self._between("max_aspect", 1, 1e4)
-        self._between("photon_count", 1, 10**9)
+        self._between("photon_count", 1, 2 * 10**8)
         self._between("passes", 1, 10**7)
         self._between("alpha", 0, 1, "above 0 and at most 1", self.alpha > 0)
         self._between("initial_radius", 0, 1e30, "0 (automatic) or a positive length")

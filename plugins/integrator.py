@@ -9,6 +9,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 from aniso_pm import progressive
+from aniso_pm.pilot import automatic_radius
+from aniso_pm.prepared import prepare
 from aniso_pm.settings import Settings
 
 
@@ -66,8 +68,9 @@ class AnisoPhotonMapper:
      * - initial_radius
        - |float|
        - Kernel radius r of the first pass in world units: weight exp(-a²-b²) with half axes of
-         :math:`|s \times t| = r^2`, cut at :math:`a^2+b^2=4`. 0 chooses the radius at which the
-         median gather point has 60 photons in its kernel. (Default: 0)
+         :math:`|s \times t| = r^2`, cut at :math:`a^2+b^2=4`. 0 chooses the radius at which a
+         kernel holds 60 photons, in the median over the light that the camera sees; the choice is
+         in ``statistics["initial_radius"]``. (Default: 0)
 
      * - alpha
        - |float|
@@ -121,24 +124,32 @@ class AnisoPhotonMapper:
 
     def __init__(self, props):
         mi.SamplingIntegrator.__init__(self, props)
+        for name in ("timeout", "samples_per_pass", "block_size"):
+            if name in props:
+                raise ValueError(
+                    f'aniso_pm: parameter "{name}" is not supported; remove it ("passes" and the '
+                    "samples per pixel say how much is rendered)"
+                )
         given = {f.name: props[f.name] for f in fields(Settings) if f.name in props}
         self.settings = Settings(**given)
         self.statistics: dict[str, Any] = {}
-        self.progress: Callable[[int, int, str], None] | None = None
-        self._map: tuple | None = None  # (scene, prepared scene, photon map, radius) of sample()
+        self.progress: Callable[[float, int, str], None] | None = None
+        self._last_map: tuple | None = None
 
     # --- Mitsuba's interface ---
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Render the scene; see ``mi.Integrator.render``. With several passes ``spp`` is their
         total."""
-        if isinstance(sensor, int):
-            sensor = scene.sensors()[sensor]
+        if not isinstance(sensor, mi.Sensor):
+            sensor = scene.sensors()[int(sensor)]
+        self.statistics, self._last_map = {}, None
         with dr.suspend_grad():
-            prepared = progressive.prepare(scene, self.settings, self.hide_emitters)
-            self.statistics = progressive.render(
-                prepared, sensor, _as_int(seed), spp, self.progress or (lambda *_: None)
+            prepared = prepare(scene, self.settings, self.hide_emitters)
+            map_, radius = progressive.render(
+                prepared, sensor, _as_int(seed), spp, self.progress or _silent, self.statistics
             )
+            self._last_map = (scene, prepared, map_, radius)
             image = sensor.film().develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)
@@ -148,18 +159,21 @@ class AnisoPhotonMapper:
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """Radiance along rays; see ``mi.SamplingIntegrator.sample``.
 
-        For integrators that contain this one (``aov``, ``moment``): a photon map is made at the
-        first call for a scene and kept for the following ones.
+        For integrators that contain this one. ``aov`` calls render() and then sample(), which
+        uses the map that render() has left; ``moment`` calls sample() alone, and each call traces
+        photons of its own, since the scene may have changed since the last one.
         """
-        active = mi.Bool(active)
-        if self._map is None or self._map[0] is not scene:
-            prepared = progressive.prepare(scene, self.settings, self.hide_emitters)
-            radius = self.settings.initial_radius or progressive.automatic_radius(
-                prepared, scene.sensors()[0], 0
-            )
-            self._map = (scene, prepared, progressive.photon_map(prepared, 0, 0), radius)
-        _, prepared, map_, radius = self._map
-        L, valid = progressive.estimate_radiance(prepared, map_, radius, sampler, ray, active)
+        left, self._last_map = self._last_map, None
+        if left is None or left[0] is not scene:
+            prepared = prepare(scene, self.settings, self.hide_emitters)
+            seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
+            radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
+            left = (scene, prepared, prepared.photon_map(seed, 0), radius)
+        _, prepared, map_, radius = left
+        L, valid, points = prepared.walk(sampler, ray, mi.Bool(active))
+        if map_.stored:
+            radius = dr.opaque(mi.Float, radius)
+            L += prepared.gather(map_, radius, sampler, points).radiance
         return L, valid, []
 
     def aov_names(self):
@@ -196,5 +210,9 @@ _NO_DERIVATIVES = (
 )
 
 
+def _silent(done, total, text):
+    """The progress function of those who do not ask for one."""
+
+
 def _as_int(seed) -> int:
-    return int(seed) if isinstance(seed, int) else int(mi.UInt32(seed)[0])
+    return int(mi.UInt32(seed)[0])

@@ -10,7 +10,7 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
-from energy import REFERENCE, region_means
+from energy import REFERENCE, indirect, region_means, regions
 from rooms import ROOMS
 from rooms import room as empty_room
 
@@ -32,8 +32,8 @@ def _variant(variant_llvm_rgb):
 
 
 def assert_agrees(room, kernel, max_depth, photon_count, passes, spp, seeds, tolerance):
-    """Every region's mean within ``tolerance`` of the reference, allowing for three standard
-    errors of the render, which must themselves be small enough to mean something."""
+    """Every region's mean within ``tolerance`` of the reference, at a standard error of less than
+    a third of that."""
     scene = mi.load_dict(ROOMS[room]())
     integrator = PHOTON_MAPPER | KERNELS[kernel] | {"photon_count": photon_count, "passes": passes}
     expected = json.loads(REFERENCE.read_text())[room][str(max_depth)]
@@ -46,23 +46,21 @@ def assert_agrees(room, kernel, max_depth, photon_count, passes, spp, seeds, tol
             continue
         ratio, sigma = mean / reference, math.hypot(error, reference_error) / reference
         report.append(f"{name}: {ratio:.4f} ± {sigma:.4f}")
-        assert sigma < tolerance, report
-        assert abs(ratio - 1) < tolerance + 3 * sigma, report
+        assert sigma < 0.3 * tolerance, report
+        assert abs(ratio - 1) < tolerance, report
     print(room, kernel, max_depth, "; ".join(report))
 
 
 @pytest.mark.parametrize("room", ROOMS)
 def test_indirect_light_agrees_with_path(room):
     # The glass ball mirrors the light itself: a small bright spot that only eye paths resolve.
-    ball = room == "ball"
-    assert_agrees(
-        room, "lobe", -1, 200_000, 4, 512 if ball else 32, range(4), 0.025 if ball else 0.015
-    )
+    spp, tolerance = (512, 0.05) if room == "ball" else (64, 0.03)
+    assert_agrees(room, "lobe", -1, 200_000, 4, spp, range(6), tolerance)
 
 
 @pytest.mark.parametrize("depth", [1, 2, 3, 4])
 def test_max_depth_means_what_it_means_to_path(depth):
-    assert_agrees("plate", "lobe", depth, 200_000, 2, 32, range(3), 0.02)
+    assert_agrees("plate", "lobe", depth, 200_000, 2, 64, range(6), 0.03)
 
 
 @pytest.mark.slow
@@ -115,7 +113,7 @@ OBJECTS = {
 
 @pytest.mark.parametrize("name", OBJECTS)
 @pytest.mark.parametrize("instanced", [False, True])
-def test_total_light_agrees_with_path_for(name, instanced):
+def test_indirect_light_agrees_with_path_around(name, instanced):
     if instanced and name not in ("asgconductor", "blend"):
         pytest.skip("one conductor and one mixture show what instances do")
     ball = {"type": "sphere", "center": [0, -0.3, -0.2], "radius": 0.5, "bsdf": OBJECTS[name]}
@@ -126,11 +124,114 @@ def test_total_light_agrees_with_path_for(name, instanced):
             "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
         }
     scene = mi.load_dict(empty_room(parts, size=24))
-    ours = mi.load_dict(PHOTON_MAPPER | {"photon_count": 100_000, "passes": 4})
-    ours = np.array(mi.render(scene, integrator=ours, spp=512))
-    path = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=2048))
-    # Mostly direct light, which both sample alike: 0.3 % of noise is left in the mean.
-    assert ours.mean() == pytest.approx(path.mean(), rel=0.012)
+    assert_mean_agrees(scene, 0.02)
+
+
+def assert_mean_agrees(scene, tolerance, spp=512, path_spp=2048):
+    """Indirect light in the mean over the image; standard errors of both are below 0.5 %."""
+    ours = PHOTON_MAPPER | {"photon_count": 100_000, "passes": 4}
+    ours = indirect(scene, ours, -1, spp, 1).mean()
+    path = indirect(scene, {"type": "path"}, -1, path_spp, 2).mean()
+    assert ours == pytest.approx(path, rel=tolerance)
+
+
+@pytest.mark.parametrize("emitter", ["point", "spot", "directional", "constant", "sphere"])
+def test_every_kind_of_light_reaches_merged_walls(emitter):
+    """Floor and wall share a BSDF, so Mitsuba merges them, and forgets how large they are."""
+    T = mi.ScalarTransform4f
+    light = {
+        "point": {"type": "point", "position": [0.5, 1.5, 0.5]},
+        "spot": {
+            "type": "spot",
+            "cutoff_angle": 40,
+            "to_world": T().look_at([1, 2, 2], [0, 0.2, 0], [0, 1, 0]),
+        },
+        "directional": {"type": "directional", "direction": [-0.4, -1, -0.6]},
+        "constant": {"type": "constant"},
+        "sphere": {
+            "type": "sphere",
+            "center": [0.5, 1.5, 0.5],
+            "radius": 0.2,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 5.0}},
+        },
+    }[emitter]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 50,
+                "to_world": T().look_at([1.5, 1.2, 3], [0, 0.4, 0], [0, 1, 0]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 24,
+                    "height": 24,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                },
+            },
+            "grey": {"type": "twosided", "b": {"type": "diffuse", "reflectance": 0.7}},
+            "floor": {
+                "type": "rectangle",
+                "to_world": T().rotate([1, 0, 0], -90),
+                "bsdf": {"type": "ref", "id": "grey"},
+            },
+            "wall": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 1, -1]),
+                "bsdf": {"type": "ref", "id": "grey"},
+            },
+            "light": light,
+        }
+    )
+    assert_mean_agrees(scene, 0.02, spp=1024)
+
+
+def test_smooth_shaded_glass_loses_no_light():
+    """A coarse mesh with interpolated normals: shading and geometric sides often disagree."""
+    import numpy as np
+
+    theta, phi = np.meshgrid(np.linspace(0.05, np.pi - 0.05, 8), np.arange(10) * 2 * np.pi / 10)
+    normals = np.stack(
+        [np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1
+    )
+    i, j = np.meshgrid(np.arange(10), np.arange(7), indexing="ij")
+    at = lambda a, b: ((a % 10) * 8 + b).ravel()  # noqa: E731
+    faces = np.concatenate(
+        [
+            np.stack([at(i, j), at(i + 1, j), at(i, j + 1)], -1),
+            np.stack([at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)], -1),
+        ]
+    )
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict({"type": "dielectric"})
+    mesh = mi.Mesh("ball", 80, len(faces), has_vertex_normals=True, props=props)
+    parameters = mi.traverse(mesh)
+    flat = normals.reshape(-1, 3).astype(np.float32)
+    parameters["vertex_positions"] = (0.45 * flat + np.float32([0, -0.3, -0.2])).ravel()
+    parameters["vertex_normals"] = flat.ravel()
+    parameters["faces"] = faces.astype(np.uint32).ravel()
+    parameters.update()
+    assert_mean_agrees(mi.load_dict(empty_room({"ball": mesh}, size=24)), 0.02)
+
+
+def test_edge_compensation_counts_receivers_only():
+    """A mirror lying flat on the floor holds no photons: kernels that reach onto it are edges."""
+    T = mi.ScalarTransform4f
+    slab = {
+        "type": "cube",
+        "to_world": T().translate([0, -0.99, 0]).scale([0.6, 0.01, 0.6]),
+        "bsdf": {"type": "conductor", "material": "none"},
+    }
+    scene = mi.load_dict(empty_room({"slab": slab}, size=32))
+    floor = regions(scene)["floor"]
+    kernel = PHOTON_MAPPER | {"photon_count": 200_000, "passes": 4}
+    wide, narrow = (
+        indirect(scene, kernel | {"initial_radius": r}, -1, 64, 3)[floor].mean()
+        for r in (0.15, 0.01)
+    )
+    assert wide == pytest.approx(narrow, rel=0.03)  # 0.93 if the mirror counts
 
 
 # --- Closed forms: no reference needed, no noise to speak of ---

@@ -157,6 +157,27 @@ def test_inside_aov_it_renders_the_same_picture(scene):
     np.testing.assert_allclose(image[..., :3].mean(), plain.mean(), rtol=0.05)
 
 
+def test_aov_uses_the_map_that_render_left(scene, monkeypatch):
+    from aniso_pm import photons
+
+    built = []
+    build_map = photons.build_map
+    monkeypatch.setattr(photons, "build_map", lambda *a: built.append(1) or build_map(*a))
+    mi.render(scene, integrator=mi.load_dict({"type": "aov", "aovs": "d:depth", "i": SMALL}), spp=1)
+    assert len(built) == 1
+
+
+def test_inside_moment_it_sees_the_scene_as_it_is_now(rgb):
+    scene = mi.load_dict(room(size=8))
+    outer = mi.load_dict({"type": "moment", "image": SMALL})
+    before = array(mi.render(scene, integrator=outer, spp=64))[..., :3].mean()
+    parameters = mi.traverse(scene)
+    parameters["light.emitter.radiance.value"] = mi.Color3f(0)
+    parameters.update()
+    after = array(mi.render(scene, integrator=outer, spp=64))[..., :3].mean()
+    assert before > 0.05 and after == 0
+
+
 def test_isotropic_and_anisotropic_are_the_same_where_nothing_is_anisotropic(rgb):
     scene = mi.load_dict(room(size=8))
     images = [
@@ -182,7 +203,7 @@ def test_progress_is_reported_after_every_pass(scene):
     plugin = integrator(passes=3)
     plugin.progress = lambda done, total, text: calls.append((done, total))
     mi.render(scene, integrator=plugin, spp=3)
-    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert calls == [(1, 3), (2, 3), (3, 3)]  # one wavefront a pass
 
 
 def test_interruption_keeps_the_passes_so_far(scene):
@@ -194,8 +215,46 @@ def test_interruption_keeps_the_passes_so_far(scene):
 
     plugin.progress = interrupt
     image = array(plugin.render(scene, spp=3))
-    assert plugin.statistics["interrupted"] and plugin.statistics["passes"] == 2
+    assert plugin.statistics["interrupted"] and plugin.statistics["spp"] == 2
     assert np.isfinite(image).all() and image.mean() > 0
+
+
+def test_a_real_interrupt_ends_in_a_picture(scene):
+    """SIGINT at any moment after the first wavefront, also while Dr.Jit traces a loop."""
+    import signal
+
+    plugin = integrator(passes=1000)
+    handler = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        for delay in (0.9, 1.3, 1.7):
+            signal.setitimer(signal.ITIMER_REAL, delay)
+            image = array(plugin.render(scene, spp=1000))
+            assert plugin.statistics["interrupted"]
+            assert 0 < plugin.statistics["spp"] < 1000
+            assert np.isfinite(image).all() and image.mean() > 0
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, handler)
+
+
+def test_statistics_of_an_earlier_render_do_not_survive_a_failure(scene):
+    plugin = integrator(passes=2)
+    mi.render(scene, integrator=plugin, spp=2)
+    with pytest.raises(ValueError):
+        plugin.render(scene, spp=1)
+    assert plugin.statistics.get("spp", 0) == 0
+
+
+def test_later_passes_compile_nothing(scene):
+    """The radius of a pass is data, not part of the kernels."""
+    mi.render(scene, integrator=integrator(passes=2), spp=2)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        mi.render(scene, integrator=integrator(passes=4, initial_radius=0.13), spp=4)
+        history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    misses = [k for k in history if not k["cache_hit"]]
+    # Photon numbers differ between passes; what depends on them is of the size of an array.
+    assert len(misses) == 0, [(k["size"], k["operation_count"]) for k in misses]
 
 
 def test_automatic_radius_scales_with_the_scene_and_the_photons(rgb):
@@ -266,6 +325,61 @@ def test_derivatives_are_refused_with_one_sentence(scene):
         plugin.render_backward(scene, None, None)
     with pytest.raises(Exception, match="derivatives are not supported"):
         plugin.render_forward(scene, None)
+
+
+def test_a_scene_without_shapes_is_rendered(rgb):
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+            "sky": {"type": "constant", "radiance": 0.25},
+        }
+    )
+    image = array(mi.render(scene, integrator=integrator(initial_radius=0.0), spp=4))
+    np.testing.assert_allclose(image[..., :3], 0.25, rtol=1e-3)
+
+
+def test_light_that_cannot_be_sampled_is_refused(rgb):
+    definition = room(size=4)
+    definition["light"]["emitter"] = {"type": "directionalarea"}
+    with pytest.raises(ValueError, match="directionalarea"):
+        integrator().render(mi.load_dict(definition), spp=1)
+
+
+@pytest.mark.parametrize("radius", [1e-9, 1e3])
+def test_a_radius_of_the_wrong_magnitude_is_refused_with_the_right_one(rgb, radius):
+    with pytest.raises(ValueError, match='"initial_radius" is .* but the scene is .* large'):
+        integrator(initial_radius=radius).render(mi.load_dict(room(size=4)), spp=1)
+
+
+@pytest.mark.parametrize("front", ["null", "mask", "thindielectric"])
+def test_hidden_sky_stays_hidden_behind_null_surfaces_as_in_path(rgb, front):
+    bsdf = {"mask": {"type": "mask", "opacity": 0.5, "b": {"type": "diffuse"}}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 8,
+                    "height": 8,
+                    "pixel_format": "rgba",
+                    "rfilter": {"type": "box"},
+                },
+            },
+            "sky": {"type": "constant", "radiance": 0.5},
+            "sheet": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, 2]).rotate([0, 1, 0], 180),
+                "bsdf": bsdf.get(front, {"type": front}),
+            },
+        }
+    )
+    ours = array(mi.render(scene, integrator=integrator(hide_emitters=True), spp=256))
+    path = mi.load_dict({"type": "path", "hide_emitters": True})
+    path = array(mi.render(scene, integrator=path, spp=256))
+    np.testing.assert_allclose(ours.mean((0, 1)), path.mean((0, 1)), rtol=0.05, atol=0.005)
 
 
 # --- Parameters ---

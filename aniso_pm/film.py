@@ -1,0 +1,61 @@
+"""Camera rays out of a film's pixels, and radiance back into them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def pixel_count(film) -> int:
+    """Pixels that are sampled: the crop window, plus the filter's border if the film wants it."""
+    width, height = _sampled_size(film)
+    return width * height
+
+
+def sample_rays(sensor, sampler, spp):
+    """Camera rays of one wavefront: (ray, weight, position on the film), spp samples a pixel in
+    consecutive lanes."""
+    film = sensor.film()
+    width, height = _sampled_size(film)
+    lane = dr.arange(mi.UInt32, width * height * spp)
+    pixel = lane // dr.opaque(mi.UInt32, spp)
+    row = pixel // width
+    corner = mi.Point2i(mi.Int32(pixel - row * width), mi.Int32(row)) - _border(film)
+    corner += mi.Point2i(mi.ScalarPoint2i(film.crop_offset()))
+
+    position = mi.Point2f(corner) + sampler.next_2d()
+    scale = mi.ScalarVector2f(1 / film.crop_size().x, 1 / film.crop_size().y)
+    normalised = (position - mi.ScalarPoint2f(film.crop_offset())) * scale
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+    ray, weight = sensor.sample_ray(time, wavelength, normalised, aperture)
+    # With a box filter the offset within the pixel only adds rounding errors at pixel borders.
+    splat_at = mi.Point2f(corner) if film.rfilter().is_box_filter() else position
+    return ray, weight, splat_at
+
+
+def splat(film, position, radiance, valid, spp):
+    """Add one wavefront of samples to the film. valid: alpha is 1 there, else 0."""
+    block = film.create_block()
+    block.set_coalesce(block.coalesce() and spp >= 4)
+    rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else radiance
+    channels = [rgb.x, rgb.y, rgb.z]
+    if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+        channels.append(dr.select(valid, mi.Float(1), mi.Float(0)))
+    channels.append(mi.Float(1))
+    block.put(position, channels)
+    film.put_block(block)
+    film.schedule_storage()
+    dr.eval()
+
+
+def _border(film) -> int:
+    return film.rfilter().border_size() if film.sample_border() else 0
+
+
+def _sampled_size(film) -> tuple[int, int]:
+    width, height = film.crop_size()
+    return width + 2 * _border(film), height + 2 * _border(film)

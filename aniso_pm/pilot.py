@@ -1,0 +1,81 @@
+"""The bandwidth of the first pass, from a small pilot of photons and eye paths.
+
+Every eye path that reaches a receiver widens its disc by factors of √2 until it holds enough pilot
+photons. A median of these radii, scaled to the photons of a full pass, is the bandwidth: robust
+from a coin to a stadium, because it looks at the densities where the camera does. Each point counts
+by the light that it receives: a caustic on a dark floor sets the bandwidth, not the floor.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import density
+from .prepared import PILOT, Prepared, stream_seed
+
+# Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
+PHOTONS_PER_KERNEL = 60
+# Light paths and eye paths of the pilot, and photons that a disc must hold to be measured.
+_PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
+# Range of radii as shares of the scene's extent: 1e-5 · √2^27 = 0.1.
+_SMALLEST, _LARGEST, _STEPS = 1e-5, 0.1, 27
+
+
+def camera_rays(sensor, seed: int):
+    """Rays through random points of the film's crop window."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(stream_seed(seed, PILOT, 2), _RAYS)
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    ray, _ = sensor.sample_ray(
+        mi.Float(sensor.shutter_open()), mi.Float(0.5), sampler.next_2d(), aperture
+    )
+    return ray
+
+
+def _weighted_median(radii) -> float:
+    """Median with weights 1/r² (proportional to the density of photons, hence to the light that
+    the point receives): half of the light is estimated at smaller radii, half at larger ones."""
+    radii = np.sort(radii)
+    light = np.cumsum(radii.astype(np.float64) ** -2)
+    return float(radii[np.searchsorted(light, 0.5 * light[-1])])
+
+
+def automatic_radius(scene: Prepared, rays, seed: int) -> float:
+    """Bandwidth (world units) at which kernels hold PHOTONS_PER_KERNEL photons in the median.
+
+    rays: any number of camera rays. The seeds are the pilot's own. Returns a hundredth of the
+    scene's extent where there is nothing to gather, and never more than a tenth of it.
+    """
+    extent = scene.extent
+    pilot = scene.with_(photon_count=min(scene.settings.photon_count, _PATHS))
+    map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
+    if map_.stored == 0:
+        return 0.01 * extent
+    count = dr.width(rays)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(stream_seed(seed, PILOT, 1), count)
+    _, _, points = scene.walk(sampler, rays, mi.Bool(True))
+    radius = dr.full(mi.Float, _SMALLEST * extent, count)
+    looking = mi.Bool(points.active)
+    dr.eval(points, looking, radius)
+    for _ in range(_STEPS):
+        disc = density.disc(points.n, radius)
+        _, found = density.estimate(map_, points, disc, radius, scene.gather_depth, looking)
+        # The number of photons grows with the area, which makes the last step exact.
+        exact = radius * dr.sqrt(_ENOUGH / mi.Float(dr.maximum(found, 1)))
+        enough = looking & (found >= _ENOUGH)
+        looking &= ~enough
+        radius = dr.select(enough, exact, dr.select(looking, radius * math.sqrt(2), radius))
+        dr.eval(looking, radius)
+        if not dr.any(looking):
+            break
+    lanes = dr.compress(points.active)
+    if dr.width(lanes) == 0:
+        return 0.01 * extent
+    median = _weighted_median(dr.gather(mi.Float, radius, lanes).numpy())
+    more_photons = scene.settings.photon_count / pilot.settings.photon_count
+    return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), _LARGEST * extent)
