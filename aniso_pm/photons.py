@@ -196,6 +196,9 @@ def _trace_wavefront(
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
         wo = si.to_world(bs.wo)
         wo_n, wo_s = dr.dot(wo, si.n), mi.Frame3f.cos_theta(bs.wo)
+        # A reflection through the geometric surface would leak, and its correction has no bound.
+        reflected = mi.Frame3f.cos_theta(si.wi) * wo_s > 0
+        active &= ~reflected | (same_side & (wo_n * wo_s > 0))
         correction = dr.abs((wi_s * wo_n) / (wo_s * wi_n))
         β *= weight * correction
         η *= bs.eta
