@@ -9,10 +9,10 @@ surface: |d·n| within half a bandwidth and normals within 41 degrees (cosine 0.
 
 m is the share of the kernel that lies on such a surface. Without it every estimate near an edge
 loses what its kernel spills over the edge. Points drawn from the kernel are probed by short rays
-along −n until the first one lands on a receiver; the number of rays is geometrically distributed
+along −n until the first one lands; the number of rays is geometrically distributed
 with mean 1/m, so it *is* an estimate of 1/m, unbiased but for the end after PROBES_MAX rays, at the
 price of one ray wherever the kernel spills nothing. A surface that goes on behind a wall counts as
-well: there the estimate stays as dark as without compensation.
+well, and so does metal or glass that lies flat on it: there the estimate stays dark.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ import mitsuba as mi
 from . import index as spatial
 from .eye import GatherPoints
 from .kernel import PlaneKernel, disc, guarded_axes
-from .needs import receiver_reflectance
 from .photons import PhotonMap, decode_normal, photon_flux, segments
 
 CUT2 = 4.0
@@ -59,7 +58,7 @@ class Gathered:
     photons   photons inside the kernel.
     follows   the kernel follows a lobe (else it is the disc).
     bounded   the lobe's kernel met the aspect cap or the grazing clamp.
-    lost      no part of the kernel was found to lie on a receiver.
+    lost      no part of the kernel was found to lie on the surface.
     """
 
     radiance: Any
@@ -124,7 +123,7 @@ def estimate(
 
 @dr.syntax
 def probe_surface(scene, sampler, points: GatherPoints, kernel: PlaneKernel, radius, active):
-    """(1/m, nothing found?): the inverse share of each kernel that lies on a receiver.
+    """(1/m, nothing found?): the inverse share of each kernel that lies on the surface.
 
     1 where none of PROBES_MAX points lay on one, which says more about the surface (finer than
     the slab, or than the resolution of its coordinates) than about its edges.
@@ -142,9 +141,8 @@ def probe_surface(scene, sampler, points: GatherPoints, kernel: PlaneKernel, rad
         q = points.p + kernel.s * (rho * cos_phi) + kernel.t * (rho * sin_phi)
         probe = mi.Ray3f(q + n * height, -n)
         probe.maxt = 2 * height
-        si = scene.ray_intersect(probe, probing)
-        is_receiver, reflectance = receiver_reflectance(si.bsdf(), si, probing)
-        on_surface = si.is_valid() & is_receiver & (dr.max(reflectance) > 0)
+        si = scene.ray_intersect(probe, mi.RayFlags.Minimal, False, probing)
+        on_surface = si.is_valid()
         on_surface &= dr.abs(dr.dot(si.n, n)) > NORMAL_COS
         landed |= probing & on_surface
         probing &= ~on_surface & (tries < PROBES_MAX)
