@@ -199,6 +199,7 @@ def _trace_wavefront(
         # A reflection through the geometric surface would leak, and its correction has no bound.
         reflected = mi.Frame3f.cos_theta(si.wi) * wo_s > 0
         active &= ~reflected | (same_side & (wo_n * wo_s > 0))
+        active &= ~dr.all(weight == 0)  # failed samples have no direction to correct for
         correction = dr.abs((wi_s * wo_n) / (wo_s * wi_n))
         β *= weight * correction
         η *= bs.eta
