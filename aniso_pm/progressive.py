@@ -16,7 +16,6 @@ import mitsuba as mi
 
 from . import film as films
 from .errors import is_interrupt
-from .eye import take_lanes
 from .pilot import automatic_radius, camera_rays
 from .prepared import EYE, PROBE, Prepared, stream_seed
 
@@ -106,7 +105,7 @@ def _eye_pass(scene: Prepared, sensor, map_, radius, seed, index, spp, statistic
     per_wavefront = max(1, min(spp, WAVEFRONT // pixels))
     # An array, not a number: as a literal it would make every pass compile kernels of its own.
     radius = dr.opaque(mi.Float, radius)
-    taken = wavefront = 0
+    taken = wavefront = expected = 0
     while taken < spp:
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(min(per_wavefront, spp - taken))
@@ -115,35 +114,24 @@ def _eye_pass(scene: Prepared, sensor, map_, radius, seed, index, spp, statistic
         seed_ = mi.sample_tea_32(stream_seed(seed, EYE, index), wavefront)[0]
         sampler.seed(seed_, pixels * count)
 
-        # --- Eye paths ---
+        # --- Eye paths and density estimation ---
         ray, ray_weight, position = films.sample_rays(sensor, sampler, count)
-        L, valid, points = scene.walk(sampler, ray, mi.Bool(True))
-        dr.eval(L, valid, points, ray_weight, position)
-        clock.lap("eye")
-
-        # --- Density estimation, for the lanes that have a gather point ---
-        lanes = dr.compress(points.active) if map_.stored else mi.UInt32()
-        if dr.width(lanes) > 0:
-            probes = mi.load_dict({"type": "independent"})
-            seed_ = mi.sample_tea_32(stream_seed(seed, PROBE, index), wavefront)[0]
-            probes.seed(seed_, dr.width(lanes))
-            found = scene.gather(map_, radius, probes, take_lanes(points, lanes))
-            gathered = dr.zeros(mi.Spectrum, dr.width(L))
-            dr.scatter(gathered, found.radiance, lanes)
-            # One kernel for all of it: a reduction by itself would run the whole gather again.
-            dr.eval(gathered, found)
-            L += gathered
-            statistics["gather_points"] += dr.width(lanes)
+        dr.eval(ray, ray_weight, position)
+        probe_seed = mi.sample_tea_32(stream_seed(seed, PROBE, index), wavefront)[0]
+        seen = scene.radiance(sampler, ray, map_, radius, probe_seed, expected, clock.lap)
+        L = seen.L
+        for found in seen.gathered:
+            statistics["gather_points"] += dr.width(found.lane)
             statistics["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
             statistics["gather_points_bounded"] += int(dr.count(found.bounded)[0])
             statistics["gather_points_off_surface"] += int(dr.count(found.lost)[0])
             statistics["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
-        clock.lap("gather")
+        expected = sum(dr.width(found.lane) for found in seen.gathered)
 
         # --- Into the film ---
         finite = dr.all(dr.isfinite(L))
         statistics["eye_samples_rejected"] += dr.width(L) - int(dr.count(finite)[0])
-        films.splat(film, position, dr.select(finite, L, 0) * ray_weight, valid, count)
+        films.splat(film, position, dr.select(finite, L, 0) * ray_weight, seen.valid, count)
         clock.lap("film")
         statistics["eye_samples"] += pixels * count
         statistics["spp"] += count
