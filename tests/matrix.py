@@ -344,6 +344,9 @@ def main():
     for name, row in rows().items():
         if arguments.names and name not in arguments.names:
             continue
+        if arguments.compare and name not in known:
+            print(f"{name:38s} has no reference yet")
+            continue
         if arguments.compare:
             results = {use: compare(row, use, known[name]) for use in USES}
             print(f"{name:38s}", *(f"{r:.4f} ± {e:.4f}" for r, e in results.values()), flush=True)
