@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -38,7 +41,9 @@ def sample_rays(sensor, sampler, spp):
 
 
 def splat(film, position, radiance, valid, spp):
-    """Add one wavefront of samples to the film. valid: alpha is 1 there, else 0."""
+    """One wavefront of samples as the film's own storage has it: TensorXf (height, width,
+    channels), weighted by the reconstruction filter, the weight in the last channel. valid: alpha
+    is 1 there, else 0."""
     block = film.create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
     rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else radiance
@@ -47,9 +52,55 @@ def splat(film, position, radiance, valid, spp):
         channels.append(dr.select(valid, mi.Float(1), mi.Float(0)))
     channels.append(mi.Float(1))
     block.put(position, channels)
-    film.put_block(block)
+    image = block.tensor()
+    dr.eval(image)
+    return image
+
+
+def show(film, image):
+    """Let the film hold ``image`` (as of :func:`splat`) and nothing else."""
+    film.clear()
+    film.put_block(mi.ImageBlock(image, mi.ScalarPoint2i(film.crop_offset())))
     film.schedule_storage()
     dr.eval()
+
+
+def channel_names(channels: int) -> list[str]:
+    """Names of a film's channels, weight not counted."""
+    return list("RGBA"[:channels])
+
+
+def describe(film) -> dict[str, Any]:
+    """What :func:`from_description` needs to make a film that develops sums as this one would."""
+    # Only its text tells the formats.
+    formats = dict(re.findall(r"(pixel_format|component_format) = (\w+)", str(film)))
+    return {
+        "size": [int(n) for n in film.size()],
+        "crop_size": [int(n) for n in film.crop_size()],
+        "crop_offset": [int(n) for n in film.crop_offset()],
+        "formats": formats,
+    }
+
+
+def from_description(description: dict[str, Any]):
+    """A film without a scene, for the sums of one that was described by :func:`describe`."""
+    (width, height), crop = description["size"], description["crop_size"]
+    offset = description["crop_offset"]
+    film = mi.load_dict(
+        {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "crop_width": crop[0],
+            "crop_height": crop[1],
+            "crop_offset_x": offset[0],
+            "crop_offset_y": offset[1],
+            "rfilter": {"type": "box"},
+            **description["formats"],
+        }
+    )
+    film.prepare([])
+    return film
 
 
 def _border(film) -> int:

@@ -20,16 +20,31 @@ class OutputError(Exception):
 
 
 @contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path`` that takes its place if the block succeeds."""
-    partial = path.with_name(f".{path.stem}.partial.{os.getpid()}{path.suffix}")
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside ``path`` that takes its place if the block succeeds, once its
+    content is on the disk."""
+    partial = _partial(path, os.getpid())
     try:
         yield partial
+        with open(partial, "rb+") as file:
+            os.fsync(file.fileno())
         os.replace(partial, path)
     except OSError as error:
         raise OutputError(f"cannot write '{path}': {error.strerror or error}") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _partial(path: Path, process: int | str) -> Path:
+    return path.with_name(f".{path.stem}.partial.{process}{path.suffix}")
+
+
+def sweep(path: Path) -> None:
+    """Remove what killed processes have left half-written for ``path``."""
+    for partial in path.parent.glob(_partial(path, "*").name):
+        process = partial.name.removesuffix(path.suffix).rpartition(".")[2]
+        if process.isdigit() and not Path("/proc", process).exists() and Path("/proc").is_dir():
+            partial.unlink(missing_ok=True)
 
 
 def check_writable(path: Path) -> None:
@@ -38,7 +53,7 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"cannot write '{path}': it is a directory")
     if not path.parent.is_dir():
         raise OutputError(f"cannot write '{path}': there is no directory '{path.parent}'")
-    partial = path.with_name(f".{path.stem}.partial.{os.getpid()}{path.suffix}")
+    partial = _partial(path, os.getpid())
     try:
         partial.touch()
         partial.unlink()
@@ -84,7 +99,7 @@ def write_exr(film, path: Path, record: Mapping[str, Any]) -> None:
     metadata["aniso_pm"] = json.dumps(record, ensure_ascii=False, allow_nan=False)
     for key, value in _flatten("aniso_pm", record):
         metadata[key] = value
-    with _replacing(path) as partial:
+    with replacing(path) as partial:
         try:
             bitmap.write(str(partial))
         except RuntimeError as error:
@@ -120,5 +135,5 @@ def write_png(film, path: Path) -> None:
         component_format=mi.Struct.Type.UInt8,
         srgb_gamma=True,
     )
-    with _replacing(path) as partial:
+    with replacing(path) as partial:
         picture.write(str(partial))

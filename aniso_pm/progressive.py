@@ -1,27 +1,80 @@
-"""Passes: fresh photons and fresh eye paths, accumulated in the film at a shrinking bandwidth.
+"""Passes: fresh photons and fresh eye paths at a shrinking bandwidth, until a rule says stop.
 
 Probabilistic progressive photon mapping [Knaus and Zwicker 2011]: pass i + 1 uses a kernel whose
 area is (i + α)/(i + 1) times that of pass i. Variance grows and bias shrinks so that the mean over
 passes converges to the right image. Passes are pure: pass i depends on (scene, parameters, seed, i)
-alone.
+alone, so that they can be rendered in several runs, or on several machines, and added up.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from . import digest, state
 from . import film as films
+from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .errors import is_interrupt
 from .eye import take_lanes
 from .pilot import automatic_radius, camera_rays
 from .prepared import EYE, PROBE, Prepared, stream_seed
+from .settings import Settings
+from .stopping import Stopping
 
 # Eye samples traced at once: bounds memory (about 250 bytes a sample).
 WAVEFRONT = 1 << 21
+# Eye samples of a pass where the number of passes is open: short against any budget.
+OPEN_PASS = 1 << 18
+# What a pass counts.
+_COUNTS = (
+    "photons_emitted",
+    "photons_stored",
+    "photons_rejected",
+    "photons_gathered",
+    "eye_samples",
+    "eye_samples_rejected",
+    "gather_points",
+    "gather_points_anisotropic",
+    "gather_points_bounded",
+    "gather_points_off_surface",
+    "spp",
+)
+
+
+@dataclass
+class Controls:
+    """What a caller may want besides the picture.
+
+    first_pass  number of the first pass.
+    progress    called as progress(done, total, text) after every wavefront: passes, which may be
+                fractions; total is None where nobody knows.
+    callback    called as callback(pass_index, image, statistics) after every pass: the picture so
+                far as a tensor, and the statistics so far.
+    checkpoint  where to keep the state.
+    """
+
+    first_pass: int = 0
+    progress: Callable[[float, int | None, str], None] | None = None
+    callback: Callable[[int, Any, dict], None] | None = None
+    checkpoint: state.Checkpoint | None = None
+
+
+@dataclass
+class Rendered:
+    """What is left of a rendering beside the film: map and radius of the last pass (None if no
+    pass was rendered), variance of the picture (None with one pass)."""
+
+    map: Any
+    radius: float | None
+    variance: np.ndarray | None
 
 
 def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
@@ -33,123 +86,318 @@ def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
     return initial_radius * math.exp(0.5 * log_area)
 
 
-def render(scene: Prepared, sensor, seed: int, spp: int, report, statistics: dict):
-    """Render all passes into the sensor's film; returns (map, radius) of the last one.
+@dataclass(frozen=True)
+class Shares:
+    """Samples per pixel of each pass."""
 
-    spp         total over all passes, shared evenly; 0 takes the sampler's own.
-    report      called as report(done, total, text) after every wavefront; done and total count
-                passes and may be fractions.
+    each: int
+    one_more: range  # passes that take one sample more than the others
+    text: str
+
+    def __call__(self, index: int) -> int:
+        return self.each + (index in self.one_more)
+
+
+def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Shares:
+    """How the passes share ``spp`` samples per pixel.
+
+    With a fixed number of passes ``spp`` is the total, shared evenly. With ``passes = 0`` a pass
+    takes ``spp`` samples, but no more than make OPEN_PASS eye samples in all, and at least one.
+
+    Raises ValueError if there are fewer samples than passes, unless time or error may end them.
+    """
+    passes = settings.passes
+    if passes == 0:
+        each, rest = max(1, min(spp, OPEN_PASS // pixels)), 0
+    elif spp >= passes:
+        each, rest = divmod(spp, passes)
+    elif settings.open_ended:
+        each, rest = 1, 0
+    else:
+        raise ValueError(
+            f"aniso_pm: {spp} samples per pixel cannot be shared by {passes} passes; "
+            f'raise the sample count to {passes} or lower the parameter "passes"'
+        )
+    text = f"{spp} by {passes} from pass {first_pass}" if rest else str(each)
+    return Shares(each, range(first_pass, first_pass + rest), text)
+
+
+def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, statistics: dict):
+    """Render passes until a stopping rule says so; leaves the picture in the sensor's film.
+
+    spp         see ``shares``; 0 takes the sampler's own.
     statistics  filled in as rendering goes on.
 
-    Ctrl-C ends rendering: the film then holds all wavefronts that were finished and
-    statistics["interrupted"] is True. It is raised on where the film is still empty.
+    Ctrl-C ends rendering: the film then holds all passes that were finished, or the wavefronts of
+    the first one, and statistics["interrupted"] is True. It is raised on where there is nothing.
+    Raises state.StateError where the checkpoint's state is not one of this rendering.
     """
-    settings = scene.settings
-    clock = _Clock()
-    film = sensor.film()
-    spp = spp or sensor.sampler().sample_count()
-    if spp < settings.passes:
-        raise ValueError(
-            f"aniso_pm: {spp} samples per pixel cannot be shared by {settings.passes} passes; "
-            f'raise the sample count to {settings.passes} or lower the parameter "passes"'
-        )
-    if not scene.scene.emitters():
-        mi.Log(mi.LogLevel.Warn, "aniso_pm: the scene has no emitters; the picture will be black")
-    film.prepare([])
-    radius0 = settings.initial_radius or automatic_radius(scene, camera_rays(sensor, seed), seed)
-    clock.lap("pilot")
-    statistics |= {
-        "initial_radius": radius0,
-        "radius_automatic": settings.initial_radius == 0,
-        "photons_emitted": 0,
-        "photons_stored": 0,
-        "photons_rejected": 0,
-        "photons_gathered": 0,
-        "eye_samples": 0,
-        "eye_samples_rejected": 0,
-        "gather_points": 0,
-        "gather_points_anisotropic": 0,
-        "gather_points_bounded": 0,
-        "gather_points_off_surface": 0,
-        "passes": 0,
-        "spp": 0,
-        "interrupted": False,
-        "seconds": clock.seconds,
-    }
-    map_ = radius = None
+    run = _Run(scene, sensor, seed, spp, controls, statistics)
+    run.start()
     try:
-        for i in range(settings.passes):
-            radius = bandwidth(radius0, settings.alpha, i)
-            map_ = scene.photon_map(seed, i, map_.stored if map_ else 0)
-            statistics["photons_emitted"] += map_.emitted
-            statistics["photons_stored"] += map_.stored
-            statistics["photons_rejected"] += map_.rejected
-            clock.lap("photons")
-            share = spp // settings.passes + (i < spp % settings.passes)
-            for done in _eye_pass(scene, sensor, map_, radius, seed, i, share, statistics, clock):
-                report(i + done / share, settings.passes, f"pass {i + 1}/{settings.passes}")
-            statistics["radius"] = radius
-            statistics["passes"] += 1
+        for index in run.numbers():
+            run.render_pass(index)
     except BaseException as error:
-        if not is_interrupt(error) or statistics["spp"] == 0:
+        if not is_interrupt(error) or not run.keep_unfinished():
             raise
         statistics["interrupted"] = True
+    finally:
+        run.stopping.close()
+    run.finish()
     _warn(statistics)
-    return map_, radius
+    return Rendered(run.map, run.radius, run.variance)
 
 
-def _eye_pass(scene: Prepared, sensor, map_, radius, seed, index, spp, statistics, clock):
-    """Trace ``spp`` eye samples a pixel against one map, wavefront by wavefront; yields the
-    samples a pixel taken so far."""
-    film = sensor.film()
-    pixels = films.pixel_count(film)
-    per_wavefront = max(1, min(spp, WAVEFRONT // pixels))
-    # An array, not a number: as a literal it would make every pass compile kernels of its own.
-    radius = dr.opaque(mi.Float, radius)
-    taken = wavefront = 0
-    while taken < spp:
-        sampler = sensor.sampler().clone()
-        sampler.set_sample_count(min(per_wavefront, spp - taken))
-        count = sampler.sample_count()  # samplers may round it up
-        sampler.set_samples_per_wavefront(count)
-        seed_ = mi.sample_tea_32(stream_seed(seed, EYE, index), wavefront)[0]
-        sampler.seed(seed_, pixels * count)
+class _Done(NamedTuple):
+    """Whole passes. Replaced by one assignment, so that Ctrl-C finds it consistent."""
 
-        # --- Eye paths ---
-        ray, ray_weight, position = films.sample_rays(sensor, sampler, count)
-        L, valid, points = scene.walk(sampler, ray, mi.Bool(True))
-        dr.eval(L, valid, points, ray_weight, position)
-        clock.lap("eye")
+    sums: Sums | None
+    passes: list[list[int]]
+    counts: dict[str, int]
 
-        # --- Density estimation, for the lanes that have a gather point ---
-        lanes = dr.compress(points.active) if map_.stored else mi.UInt32()
-        if dr.width(lanes) > 0:
-            probes = mi.load_dict({"type": "independent"})
-            seed_ = mi.sample_tea_32(stream_seed(seed, PROBE, index), wavefront)[0]
-            probes.seed(seed_, dr.width(lanes))
-            found = scene.gather(map_, radius, probes, take_lanes(points, lanes))
-            gathered = dr.zeros(mi.Spectrum, dr.width(L))
-            dr.scatter(gathered, found.radiance, lanes)
-            # One kernel for all of it: a reduction by itself would run the whole gather again.
-            dr.eval(gathered, found)
-            L += gathered
-            statistics["gather_points"] += dr.width(lanes)
-            statistics["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
-            statistics["gather_points_bounded"] += int(dr.count(found.bounded)[0])
-            statistics["gather_points_off_surface"] += int(dr.count(found.lost)[0])
-            statistics["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
-        clock.lap("gather")
 
-        # --- Into the film ---
-        finite = dr.all(dr.isfinite(L))
-        statistics["eye_samples_rejected"] += dr.width(L) - int(dr.count(finite)[0])
-        films.splat(film, position, dr.select(finite, L, 0) * ray_weight, valid, count)
-        clock.lap("film")
-        statistics["eye_samples"] += pixels * count
-        statistics["spp"] += count
-        taken += count
-        wavefront += 1
-        yield min(taken, spp)
+class _Run:
+    """One call of ``render``: what changes from pass to pass."""
+
+    def __init__(self, scene, sensor, seed, spp, controls, statistics):
+        self.scene, self.sensor, self.seed = scene, sensor, seed
+        self.controls, self.statistics = controls, statistics
+        self.film = sensor.film()
+        spp = spp or sensor.sampler().sample_count()
+        pixels = films.pixel_count(self.film)
+        self.shares = shares(scene.settings, spp, pixels, controls.first_pass)
+        self.stopping = Stopping(scene.settings)
+        self.clock = _Clock()
+        self.map = self.radius = self.variance = None
+        self.done = _Done(None, [], dict.fromkeys((*_COUNTS, "passes"), 0))
+        self.unfinished = None  # (image, counts) of the pass that is being rendered
+
+    # --- Before the first pass ---
+
+    def start(self):
+        """Pilot, or the state of an earlier run."""
+        if not self.scene.scene.emitters():
+            mi.Log(
+                mi.LogLevel.Warn, "aniso_pm: the scene has no emitters; the picture will be black"
+            )
+        self.film.prepare([])
+        settings, checkpoint = self.scene.settings, self.controls.checkpoint
+        earlier = checkpoint.start() if checkpoint else None
+        known = earlier.identity if earlier else {}
+        self.radius0 = settings.initial_radius or known.get("initial radius")
+        if not self.radius0:
+            rays = camera_rays(self.sensor, self.seed)
+            self.radius0 = automatic_radius(self.scene, rays, self.seed)
+        self.clock.lap("pilot")
+        if checkpoint:
+            self.identity = digest.identity(self.scene, self.sensor, self.seed, self.shares.text)
+            self.identity |= {
+                "initial radius": self.radius0,
+                "photon count": settings.photon_count,
+            }
+        self.statistics |= {
+            "initial_radius": self.radius0,
+            "radius_automatic": settings.initial_radius == 0,
+            **self.done.counts,
+            "relative_error": None,
+            "interrupted": False,
+            "seconds": self.clock.seconds,
+        }
+        if earlier:
+            self._go_on_from(earlier)
+
+    def _go_on_from(self, earlier: state.State):
+        path = self.controls.checkpoint.path
+        earlier.check_same(self.identity, path)
+        first, count = self.controls.first_pass, self.scene.settings.passes
+        end = first + count if count else math.inf
+        if any(a < first or b > end for a, b in earlier.passes):
+            wanted = f"{first}-{end - 1}" if count else f"{first} and later"
+            raise state.StateError(
+                f"{path}: holds passes {state.describe(earlier.passes)}, "
+                f"but passes {wanted} are asked for"
+            )
+        counts = {name: earlier.statistics[name] for name in self.done.counts}
+        self.done = _Done(Sums.from_arrays(earlier.arrays), earlier.passes, counts)
+        self.stopping.spent_before = earlier.seconds
+        self.statistics |= counts
+        self.clock.go_on_from(earlier.statistics["seconds"])
+
+    # --- Passes ---
+
+    def numbers(self):
+        """Pass numbers to render, until a rule says stop."""
+        first, count = self.controls.first_pass, self.scene.settings.passes
+        done = set(state.numbers(self.done.passes))
+        self._check_error()
+        for index in range(first, first + count) if count else itertools.count(first):
+            if index in done:
+                continue
+            if self.stopping.reached(len(done), self.statistics["relative_error"]):
+                return
+            yield index
+            done.add(index)
+
+    def render_pass(self, index: int):
+        """One pass, from photons to sums, and what is due after it."""
+        with self.stopping.measured():
+            # --- Photons ---
+            self.unfinished = None
+            self.radius = bandwidth(self.radius0, self.scene.settings.alpha, index)
+            self.map = self.scene.photon_map(self.seed, index, self.map.stored if self.map else 0)
+            counts = dict.fromkeys(_COUNTS, 0)
+            counts["photons_emitted"] = self.map.emitted
+            counts["photons_stored"] = self.map.stored
+            counts["photons_rejected"] = self.map.rejected
+            self.clock.lap("photons")
+
+            # --- Eye paths ---
+            share = self.shares(index)
+            for image, taken in self._eye_pass(index, share, counts):
+                self.unfinished = image, dict(counts)
+                if taken < share:
+                    self._report(index, taken / share)
+
+            # --- One more pass is done ---
+            sums = self.done.sums
+            if sums is None:
+                # Variances are worth their memory where there can be any, now or after a merge.
+                variance = self.scene.settings.passes != 1 or self.controls.checkpoint is not None
+                sums = Sums.zeros(image.shape, variance)
+            total = {name: n + counts.get(name, 1) for name, n in self.done.counts.items()}
+            passes = state.extended(self.done.passes, index)
+            self.done = _Done(sums.plus(image), passes, total)
+            self.unfinished = None
+            self.statistics |= {**total, "radius": self.radius}
+            self._check_error()
+            self.clock.lap("film")
+            self._report(index, 1)
+            self._after_pass(index)
+
+    def _eye_pass(self, index, spp, counts):
+        """Trace ``spp`` eye samples a pixel against the map, wavefront by wavefront; yields (image
+        so far as film blocks hold it, samples a pixel so far)."""
+        scene, sensor, map_ = self.scene, self.sensor, self.map
+        film = sensor.film()
+        pixels = films.pixel_count(film)
+        per_wavefront = max(1, min(spp, WAVEFRONT // pixels))
+        # An array, not a number: as a literal it would make every pass compile kernels of its own.
+        radius = dr.opaque(mi.Float, self.radius)
+        image = None
+        taken = wavefront = 0
+        while taken < spp:
+            sampler = sensor.sampler().clone()
+            sampler.set_sample_count(min(per_wavefront, spp - taken))
+            count = sampler.sample_count()  # samplers may round it up
+            sampler.set_samples_per_wavefront(count)
+            seed = mi.sample_tea_32(stream_seed(self.seed, EYE, index), wavefront)[0]
+            sampler.seed(seed, pixels * count)
+
+            # --- Eye paths ---
+            ray, ray_weight, position = films.sample_rays(sensor, sampler, count)
+            L, valid, points = scene.walk(sampler, ray, mi.Bool(True))
+            dr.eval(L, valid, points, ray_weight, position)
+            self.clock.lap("eye")
+
+            # --- Density estimation, for the lanes that have a gather point ---
+            lanes = dr.compress(points.active) if map_.stored else mi.UInt32()
+            if dr.width(lanes) > 0:
+                probes = mi.load_dict({"type": "independent"})
+                seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
+                probes.seed(seed, dr.width(lanes))
+                found = scene.gather(map_, radius, probes, take_lanes(points, lanes))
+                gathered = dr.zeros(mi.Spectrum, dr.width(L))
+                dr.scatter(gathered, found.radiance, lanes)
+                # One kernel for all of it: a reduction by itself would run the whole gather again.
+                dr.eval(gathered, found)
+                L += gathered
+                counts["gather_points"] += dr.width(lanes)
+                counts["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
+                counts["gather_points_bounded"] += int(dr.count(found.bounded)[0])
+                counts["gather_points_off_surface"] += int(dr.count(found.lost)[0])
+                counts["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
+            self.clock.lap("gather")
+
+            # --- Into the image ---
+            finite = dr.all(dr.isfinite(L))
+            counts["eye_samples_rejected"] += dr.width(L) - int(dr.count(finite)[0])
+            L = dr.select(finite, L, 0) * ray_weight
+            splats = films.splat(film, position, L, valid, count)
+            image = splats if image is None else image + splats
+            dr.eval(image)
+            self.clock.lap("film")
+            counts["eye_samples"] += pixels * count
+            counts["spp"] += count
+            taken += count
+            wavefront += 1
+            yield image, min(taken, spp)
+
+    # --- After a pass ---
+
+    def _check_error(self):
+        """Estimate the error after each pass, and rarer the more there are, if anybody asks."""
+        asked = self.scene.settings.target_error or self.controls.progress or self.controls.callback
+        if asked and self.stopping.is_checkpoint(self.done.counts["passes"]):
+            self._estimate_error()
+
+    def _estimate_error(self):
+        sums, count = self.done.sums, self.done.counts["passes"]
+        if count > 1 and sums.square is not None:
+            mean, self.variance = mean_and_variance(sums.arrays(), count)
+            self.statistics["relative_error"] = relative_standard_error(mean, self.variance)
+
+    def _report(self, index: int, part: float):
+        if self.controls.progress is None:
+            return
+        count, error = self.done.counts["passes"], self.statistics["relative_error"]
+        total = self.stopping.expected_total(count, error)
+        number = f"pass {index + 1}"
+        if self.scene.settings.passes:
+            number += f"/{self.controls.first_pass + self.scene.settings.passes}"
+        text = number + (f", error {error:.2%}" if error else "")
+        self.controls.progress(count + part if part < 1 else count, total, text)
+
+    def _after_pass(self, index: int):
+        checkpoint, callback = self.controls.checkpoint, self.controls.callback
+        due = checkpoint is not None and checkpoint.due()
+        if due or callback:
+            films.show(self.film, self.done.sums.film_tensor())
+        if callback:
+            callback(index, self.film.develop(), dict(self.statistics))
+        if due:
+            self._estimate_error()
+            checkpoint.write(self._state())
+
+    def _state(self) -> state.State:
+        return state.State(
+            self.identity,
+            films.describe(self.film),
+            self.done.passes,
+            self.stopping.spent(),
+            self.statistics,
+            self.done.sums.arrays(),
+        )
+
+    # --- At the end ---
+
+    def keep_unfinished(self) -> bool:
+        """After an interruption: is there a picture? Whole passes only, or the wavefronts of the
+        first one."""
+        if self.done.sums is None and self.unfinished is not None:
+            image, counts = self.unfinished
+            sums = Sums.zeros(image.shape, False).plus(image)
+            self.done = _Done(sums, [], counts | {"passes": 0})
+        return self.done.sums is not None
+
+    def finish(self):
+        """The picture into the film, the state to the disk."""
+        self.statistics |= self.done.counts
+        if self.done.sums is not None:
+            films.show(self.film, self.done.sums.film_tensor())
+        if self.done.passes:
+            self._estimate_error()
+            if self.controls.checkpoint:
+                self.controls.checkpoint.write(self._state())
 
 
 def _warn(statistics):
@@ -174,6 +422,11 @@ class _Clock:
     def __init__(self):
         self.seconds: dict[str, float] = {}
         self.last = time.perf_counter()
+
+    def go_on_from(self, seconds: dict[str, float]):
+        """Count on from an earlier run."""
+        for stage, spent in seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
 
     def lap(self, stage: str):
         dr.sync_thread()
