@@ -65,9 +65,9 @@ def show(film, image):
     dr.eval()
 
 
-def channel_names(channels: int) -> list[str]:
-    """Names of a film's channels, weight not counted."""
-    return list("RGBA"[:channels])
+def show_array(film, array):
+    """As :func:`show`, from a NumPy array."""
+    show(film, mi.TensorXf(array.astype("float32")))
 
 
 def describe(film) -> dict[str, Any]:

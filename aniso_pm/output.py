@@ -79,18 +79,24 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def write_exr(film, path: Path, record: Mapping[str, Any]) -> None:
+def write_exr(film, path: Path, record: Mapping[str, Any], variance=None) -> None:
     """Write ``film`` with all its channels as OpenEXR.
 
     ``record`` (nested mappings) goes into the header twice: whole, as JSON, in the attribute
     ``aniso_pm``; and flat, one attribute ``aniso_pm.outer.inner`` for each number or text.
+
+    ``variance`` (height × width × channels R, G, B, perhaps A), that of the picture, adds the
+    layers ``variance`` and ``standard_error``, its root. All channels are float32 then: half
+    precision has no room for a variance of 1e-8.
     """
     import mitsuba as mi
 
     bitmap = film.bitmap()
+    if variance is not None:
+        bitmap = _with_layers(bitmap, {"variance": variance, "standard_error": variance**0.5})
     # Only its text tells in which format the film wants to be stored. Pictures with AOVs stay
     # float32: Mitsuba's conversion renames such channels and then fails to find them.
-    if "component_format = float16" in str(film):
+    elif "component_format = float16" in str(film):
         if bitmap.pixel_format() != mi.Bitmap.PixelFormat.MultiChannel:
             bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16, srgb_gamma=False)
 
@@ -104,6 +110,21 @@ def write_exr(film, path: Path, record: Mapping[str, Any]) -> None:
             bitmap.write(str(partial))
         except RuntimeError as error:
             raise OutputError(f"cannot write '{path}': {error}") from error
+
+
+def _with_layers(bitmap, layers: Mapping[str, Any]):
+    """``bitmap`` with more channels, named ``layer.R`` and so on."""
+    import mitsuba as mi
+    import numpy as np
+
+    pixels = np.array(bitmap, dtype=np.float32)
+    parts = [pixels.reshape(*pixels.shape[:2], -1)]
+    names = [part.name for part in bitmap.struct_()]
+    for layer, values in layers.items():
+        parts.append(np.asarray(values, dtype=np.float32))
+        names += [f"{layer}.{channel}" for channel in "RGBA"[: values.shape[2]]]
+    pixels = np.concatenate(parts, axis=2)
+    return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names)
 
 
 def _flatten(prefix: str, value: Any) -> Iterator[tuple[str, str | int | float]]:

@@ -367,6 +367,8 @@ class _Run:
         if due:
             self._estimate_error()
             checkpoint.write(self._state())
+            if checkpoint.on_write:
+                checkpoint.on_write()
 
     def _state(self) -> state.State:
         return state.State(

@@ -55,13 +55,9 @@ class State:
         """Number of passes."""
         return sum(end - start for start, end in self.passes)
 
-    def mean_and_variance(self):
-        """(mean image, variance of the mean image or None with one pass)."""
-        if self.count > 1:
-            return mean_and_variance(self.arrays, self.count)
-        weight = self.arrays["first"][..., -1:]
-        safe = np.where(weight != 0, weight, 1)
-        return self.arrays["first"][..., :-1] / safe, None
+    def variance(self) -> np.ndarray | None:
+        """Variance of the picture, height × width × channels; None with one pass."""
+        return mean_and_variance(self.arrays, self.count)[1] if self.count > 1 else None
 
     def save(self, path: Path) -> None:
         """Write atomically, down to the disk. Raises ``output.OutputError``."""
