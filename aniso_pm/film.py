@@ -72,8 +72,10 @@ def show_array(film, array):
 
 def describe(film) -> dict[str, Any]:
     """What :func:`from_description` needs to make a film that develops sums as this one would."""
-    # Only its text tells the formats.
+    # Only its text tells the formats, and in short.
     formats = dict(re.findall(r"(pixel_format|component_format) = (\w+)", str(film)))
+    long = {"y": "luminance", "ya": "luminance_alpha"}
+    formats = {name: long.get(value, value) for name, value in formats.items()}
     return {
         "size": [int(n) for n in film.size()],
         "crop_size": [int(n) for n in film.crop_size()],
