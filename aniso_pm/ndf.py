@@ -70,7 +70,8 @@ def children(bsdf) -> dict:
             self.found = {}
 
         def put(self, name, value, flags, cpptype=None):
-            self.found[name] = value
+            plain = cpptype is not None  # a number inside the BSDF, behind a pointer
+            self.found[name] = mi.get_property(value, cpptype, bsdf) if plain else value
 
     collect = Collect()
     bsdf.traverse(collect)
@@ -82,13 +83,9 @@ def nested_bsdfs(found: dict) -> list:
     return [value for value in found.values() if isinstance(value, mi.BSDF)]
 
 
-def roughness_source(bsdf):
-    """How to read the roughness of a BSDF, looking through wrappers: a function of (si, active)
-    that returns (alpha_u, alpha_v), or None where the BSDF has no roughness that can be read.
-
-    Wrappers (``twosided``, ``mask``, ``bumpmap``, ``normalmap``, ``blendbsdf``) are seen through
-    to the first nested BSDF that has a roughness, the back side of ``twosided`` apart.
-    """
+def own_roughness(bsdf):
+    """How to read the roughness of a BSDF by itself: a function of (si, active) that returns
+    (alpha_u, alpha_v), or None where it has none that can be read (wrappers have none)."""
     found = children(bsdf)
 
     def value(name, si, active):
@@ -99,7 +96,7 @@ def roughness_source(bsdf):
         return lambda si, active: (value("alpha_u", si, active), value("alpha_v", si, active))
     if "alpha" in found:
         return lambda si, active: (value("alpha", si, active),) * 2
-    if "roughness" in found and "spec_tint" in found or "anisotropic" in found:
+    if "roughness" in found and ("spec_tint" in found or "anisotropic" in found):
         # Mitsuba's principled BSDFs, after Burley (2012).
         def principled(si, active):
             r2 = dr.square(value("roughness", si, active))
@@ -108,7 +105,17 @@ def roughness_source(bsdf):
             return dr.maximum(r2 / aspect, 1e-3), dr.maximum(r2 * aspect, 1e-3)
 
         return principled
+    return None
 
+
+def roughness_source(bsdf):
+    """``own_roughness`` through wrappers (``twosided``, ``mask``, ``bumpmap``, ``normalmap``,
+    ``blendbsdf``): that of the first nested BSDF that has one; ``twosided`` takes the side seen.
+    """
+    own = own_roughness(bsdf)
+    if own is not None:
+        return own
+    found = children(bsdf)
     sources = [roughness_source(nested) for nested in nested_bsdfs(found)]
     if bsdf.class_name() == "TwoSidedBRDF" and len(sources) == 2 and all(sources):
         front, back = sources

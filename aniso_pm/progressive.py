@@ -23,7 +23,6 @@ from . import digest, state
 from . import film as films
 from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .errors import is_interrupt
-from .eye import take_lanes
 from .pilot import automatic_radius, camera_rays
 from .prepared import EYE, PROBE, Prepared, stream_seed
 from .settings import Settings
@@ -284,7 +283,7 @@ class _Run:
         # An array, not a number: as a literal it would make every pass compile kernels of its own.
         radius = dr.opaque(mi.Float, self.radius)
         image = None
-        taken = wavefront = 0
+        taken = wavefront = expected = 0
         while taken < spp:
             sampler = sensor.sampler().clone()
             sampler.set_sample_count(min(per_wavefront, spp - taken))
@@ -293,36 +292,24 @@ class _Run:
             seed = mi.sample_tea_32(stream_seed(self.seed, EYE, index), wavefront)[0]
             sampler.seed(seed, pixels * count)
 
-            # --- Eye paths ---
+            # --- Eye paths and density estimation ---
             ray, ray_weight, position = films.sample_rays(sensor, sampler, count)
-            L, valid, points = scene.walk(sampler, ray, mi.Bool(True))
-            dr.eval(L, valid, points, ray_weight, position)
-            self.clock.lap("eye")
-
-            # --- Density estimation, for the lanes that have a gather point ---
-            lanes = dr.compress(points.active) if map_.stored else mi.UInt32()
-            if dr.width(lanes) > 0:
-                probes = mi.load_dict({"type": "independent"})
-                seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
-                probes.seed(seed, dr.width(lanes))
-                found = scene.gather(map_, radius, probes, take_lanes(points, lanes))
-                gathered = dr.zeros(mi.Spectrum, dr.width(L))
-                dr.scatter(gathered, found.radiance, lanes)
-                # One kernel for all of it: a reduction by itself would run the whole gather again.
-                dr.eval(gathered, found)
-                L += gathered
-                counts["gather_points"] += dr.width(lanes)
+            dr.eval(ray, ray_weight, position)
+            seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
+            seen = scene.radiance(sampler, ray, map_, radius, seed, expected, self.clock.lap)
+            for found in seen.gathered:
+                counts["gather_points"] += dr.width(found.lane)
                 counts["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
                 counts["gather_points_bounded"] += int(dr.count(found.bounded)[0])
                 counts["gather_points_off_surface"] += int(dr.count(found.lost)[0])
                 counts["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
-            self.clock.lap("gather")
+            expected = sum(dr.width(found.lane) for found in seen.gathered)
 
             # --- Into the image ---
-            finite = dr.all(dr.isfinite(L))
-            counts["eye_samples_rejected"] += dr.width(L) - int(dr.count(finite)[0])
-            L = dr.select(finite, L, 0) * ray_weight
-            splats = films.splat(film, position, L, valid, count)
+            finite = dr.all(dr.isfinite(seen.L))
+            counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
+            L = dr.select(finite, seen.L, 0) * ray_weight
+            splats = films.splat(film, position, L, seen.valid, count)
             image = splats if image is None else image + splats
             dr.eval(image)
             self.clock.lap("film")

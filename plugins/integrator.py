@@ -58,6 +58,24 @@ class AnisoPhotonMapper:
        - |float|
        - Largest ratio of a kernel's axes, between 1 and 10,000. (Default: 32)
 
+     * - map
+       - |string|
+       - ``global``: all indirect light is read from the photon map at the first receiver.
+         ``caustic``: the map holds only light that reached a receiver over glass, mirrors and glossy
+         surfaces; everything else is path traced, and scenes without caustics have no map.
+         (Default: ``global``)
+
+     * - final_gather
+       - |bool|
+       - Read only caustics at the first receiver and everything at the second one: smoother than
+         ``map=global`` at the price of longer eye paths. (Default: |false|)
+
+     * - gather_roughness
+       - |float|
+       - Roughness alpha from which on a glossy surface is a receiver, with its BSDF evaluated for
+         every photon; below it paths go on. At least 0.01; a large number leaves receivers to
+         diffuse surfaces and components. (Default: 0.2)
+
      * - photon_count
        - |int|
        - Light paths per pass. (Default: 250000)
@@ -115,8 +133,9 @@ class AnisoPhotonMapper:
        - Hide directly visible emitters. (Default: |false|)
 
     Direct light comes from emitter sampling combined with BSDF sampling; everything that reaches a
-    Lambertian surface over two path segments or more comes from the photon map. Surfaces that are
-    not Lambertian are walked through by photons and eye paths, as a path tracer does.
+    receiver over two path segments or more comes from the photon map. Receivers are diffuse surfaces,
+    the diffuse part of ``plastic`` and ``roughplastic``, and surfaces whose roughness is at least
+    ``gather_roughness``. Photons and eye paths walk on all others, as a path tracer does.
 
     After ``render()`` the attribute ``statistics`` holds counts and timings. After two passes or
     more ``variance`` holds the variance of the picture (NumPy array, height × width × channels),
@@ -167,8 +186,23 @@ class AnisoPhotonMapper:
         self.checkpoint: Checkpoint | None = None
         self.first_pass = 0
         self._last_map: tuple | None = None
+        self._exposed: dict[str, Any] = {}
 
     # --- Mitsuba's interface ---
+
+    def traverse(self, callback):
+        """Numbers and switches are reachable through ``mi.traverse``; the names of kernel, rule,
+        size and map change through the attribute ``settings``."""
+        for name, value in asdict(self.settings).items():
+            if not isinstance(value, str):
+                array = {bool: mi.Bool, int: mi.Int32, float: mi.Float}[type(value)]
+                self._exposed[name] = array(value)
+                callback.put(name, self._exposed[name], mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys):
+        """Take over what ``mi.traverse`` has changed. Raises ValueError for a value out of range."""
+        changed = {name: self._exposed[name][0] for name in keys if name in self._exposed}
+        self.settings = self.settings.with_(**changed)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Render the scene; see ``mi.Integrator.render``. With several passes ``spp`` is their
@@ -207,11 +241,9 @@ class AnisoPhotonMapper:
             radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
             left = (scene, prepared, prepared.photon_map(seed, 0), radius)
         _, prepared, map_, radius = left
-        L, valid, points = prepared.walk(sampler, ray, mi.Bool(active))
-        if map_.stored:
-            radius = dr.opaque(mi.Float, radius)
-            L += prepared.gather(map_, radius, sampler, points).radiance
-        return L, valid, []
+        seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
+        seen = prepared.radiance(sampler, ray, map_, dr.opaque(mi.Float, radius), seed)
+        return dr.select(active, seen.L, 0), seen.valid & active, []
 
     def aov_names(self):
         return []
