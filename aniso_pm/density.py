@@ -149,9 +149,11 @@ class Surface:
     roughness: float
 
     @staticmethod
-    def at(scene, points: GatherPoints, roughness: float) -> Surface:
+    def at(scene, points: GatherPoints, roughness: float, wavelengths) -> Surface:
         """Found again by the rays that found it first."""
         ray = mi.Ray3f(points.origin, points.d)
+        if wavelengths is not None:
+            ray.wavelengths = wavelengths
         si = scene.ray_intersect(ray)
         return Surface(si.bsdf(ray), si, roughness)
 

@@ -46,6 +46,7 @@ class TraceOptions:
     general       the scene has receivers that are not Lambertian: keep directions.
     roughness     smallest alpha that is gathered on.
     unseen_light  the scene has direct light that only photons can find.
+    wavelengths   nm, of all photons (spectral variants), else None.
     """
 
     max_depth: int
@@ -54,6 +55,7 @@ class TraceOptions:
     general: bool
     roughness: float
     unseen_light: bool
+    wavelengths: Any = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class PhotonMap:
                or not in the highest.
     flux       W, interleaved channels, padded to a power of two.
     direction  where the light came from, 32 bits octahedral; None where no receiver needs it.
+    wavelengths  nm, in spectral variants; the flux is W/nm then.
     """
 
     emitted: int
@@ -75,9 +78,10 @@ class PhotonMap:
     index: Any
     flux: Any
     direction: Any
+    wavelengths: Any
 
 
-EMPTY = PhotonMap(0, 0, 0, None, None, None)
+EMPTY = PhotonMap(0, 0, 0, None, None, None, None)
 # Segments that the word can tell apart: this number stands for itself and more.
 SEGMENTS_MAX = 127
 
@@ -98,7 +102,7 @@ def build_map(
         scene, source, photon_count, seed, options, expected or int(_FIRST_GUESS * photon_count)
     )
     if stored == 0:
-        return PhotonMap(photon_count, 0, rejected, None, None, None)
+        return PhotonMap(photon_count, 0, rejected, None, None, None, None)
     used = dr.arange(mi.UInt32, stored)
     position, word = (dr.gather(type(v), v, used) for v in (photons.position, photons.word))
     index = spatial.build(position, word)
@@ -108,7 +112,9 @@ def build_map(
     if options.general:
         direction = dr.gather(mi.UInt32, photons.direction, index.order)
     dr.eval(sorted_flux, direction)
-    return PhotonMap(photon_count, stored, rejected, index, sorted_flux, direction)
+    return PhotonMap(
+        photon_count, stored, rejected, index, sorted_flux, direction, options.wavelengths
+    )
 
 
 def photon_flux(photons: PhotonMap, slot, active):
@@ -225,7 +231,11 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
 
     # --- Leave the emitter ---
     ray, emitted, emitter = source.sample_ray(
-        mi.Float(0), sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+        mi.Float(0),
+        sampler.next_1d(),
+        sampler.next_2d(),
+        sampler.next_2d(),
+        wavelengths=o.wavelengths,
     )
     finite = dr.all(dr.isfinite(emitted))
     reject(~finite)

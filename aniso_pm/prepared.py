@@ -13,7 +13,7 @@ from .needs import Needs, read_scene
 from .settings import Settings
 
 # Independent streams of random numbers.
-EYE, PROBE, PHOTONS, PILOT = range(4)
+EYE, PROBE, PHOTONS, PILOT, COLOUR = range(5)
 
 
 class Unsupported(ValueError):
@@ -89,8 +89,13 @@ class Prepared:
         tested = self.deep or self.use != "global"
         return limit if tested and 0 < limit <= photons.SEGMENTS_MAX else 0
 
-    def photon_map(self, seed: int, index: int, expected: int = 0) -> photons.PhotonMap:
-        """Photon map of pass ``index``; empty where nothing in the scene could use one."""
+    def photon_map(
+        self, seed: int, index: int, expected: int = 0, wavelengths=None
+    ) -> photons.PhotonMap:
+        """Photon map of pass ``index``; empty where nothing in the scene could use one.
+
+        wavelengths: nm, of the photons, in spectral variants.
+        """
         if not self.needs_map:
             return photons.EMPTY
         s = self.settings
@@ -101,6 +106,7 @@ class Prepared:
             bool(self.needs.general),
             s.gather_roughness,
             bool(self.needs.unseen),
+            wavelengths,
         )
         seed = stream_seed(seed, PHOTONS, index)
         return photons.build_map(self.scene, self.emission, s.photon_count, seed, options, expected)
@@ -121,10 +127,14 @@ class Prepared:
         )
         return eye.trace(self.scene, sampler, ray, options, expected)
 
-    def gather(self, map_, radius, seed: int, points: eye.GatherPoints) -> list[density.Gathered]:
+    def gather(
+        self, map_, radius, seed: int, points: eye.GatherPoints, wavelengths=None
+    ) -> list[density.Gathered]:
         """Reflected radiance at gather points, edges compensated where that is asked for.
 
-        radius: bandwidth, world units; a Dr.Jit array, so that its value is no part of the kernel.
+        radius       bandwidth, world units; a Dr.Jit array, so that its value is no part of the
+                     kernel.
+        wavelengths  nm, of the eye paths, in spectral variants.
         """
         if points.lambertian is None:
             return [self._gather(map_, radius, seed, points, None)]
@@ -136,7 +146,7 @@ class Prepared:
                 surface = None
                 if general:
                     roughness = self.settings.gather_roughness
-                    surface = density.Surface.at(self.scene, some, roughness)
+                    surface = density.Surface.at(self.scene, some, roughness, wavelengths)
                 parts.append(self._gather(map_, radius, seed, some, surface))
         return parts
 
@@ -174,7 +184,7 @@ class Prepared:
         lap("eye")
         gathered = []
         if points is not None and map_.stored:
-            gathered = self.gather(map_, radius, seed, points)
+            gathered = self.gather(map_, radius, seed, points, map_.wavelengths)
             L = mi.Spectrum(L)
             for found in gathered:
                 dr.scatter_add(L, found.radiance, found.lane)
@@ -185,11 +195,6 @@ class Prepared:
 
 def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
     """Read the scene. Raises Unsupported with one sentence where it cannot be rendered."""
-    if mi.is_spectral:
-        raise Unsupported(
-            f'aniso_pm: variant "{mi.variant()}" is not supported (photons and eye paths would '
-            "have to share wavelengths); choose llvm_ad_rgb, llvm_ad_mono or their cuda_ twins"
-        )
     if mi.is_polarized:
         raise Unsupported(
             f'aniso_pm: variant "{mi.variant()}" is not supported (photons carry no '
@@ -197,10 +202,10 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
         )
     try:
         needs = read_scene(scene, settings.gather_roughness)
+        source = emission.prepare(scene) if scene.emitters() else None
     except ValueError as error:
         raise Unsupported(str(error)) from None
     _repair_bounds(scene)
-    source = emission.prepare(scene) if scene.emitters() else None
     prepared = Prepared(scene, needs, settings, hide_emitters, source)
     radius, extent = settings.initial_radius, prepared.extent
     if radius and scene.shapes() and not 1e-7 * extent <= radius <= 10 * extent:
@@ -232,4 +237,4 @@ def _repair_bounds(scene):
 
 def stream_seed(seed: int, stream: int, index: int = 0) -> int:
     """Seed of an independent stream of random numbers, by rounds of a block cipher (TEA)."""
-    return mi.sample_tea_32(mi.sample_tea_32(seed, 4 * index + stream)[0], 0x5EED)[0]
+    return mi.sample_tea_32(mi.sample_tea_32(seed, 8 * index + stream)[0], 0x5EED)[0]

@@ -24,7 +24,7 @@ from . import film as films
 from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .errors import is_interrupt
 from .pilot import automatic_radius, camera_rays
-from .prepared import EYE, PROBE, Prepared, stream_seed
+from .prepared import COLOUR, EYE, PROBE, Prepared, stream_seed
 from .settings import Settings
 from .stopping import Stopping
 
@@ -32,6 +32,8 @@ from .stopping import Stopping
 WAVEFRONT = 1 << 21
 # Eye samples of a pass where the number of passes is open: short against any budget.
 OPEN_PASS = 1 << 18
+# Passes that make the colours of a spectral picture right within about a percent.
+_SPECTRAL_PASSES = 16
 # What a pass counts.
 _COUNTS = (
     "photons_emitted",
@@ -179,6 +181,13 @@ class _Run:
             mi.Log(
                 mi.LogLevel.Warn, "aniso_pm: the scene has no emitters; the picture will be black"
             )
+        passes = self.scene.settings.passes
+        if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"aniso_pm: all light of a pass shares four wavelengths; {passes} passes will give "
+                f'wrong colours, set the parameter "passes" to {_SPECTRAL_PASSES} or more',
+            )
         self.film.prepare([])
         settings, checkpoint = self.scene.settings, self.controls.checkpoint
         earlier = checkpoint.start() if checkpoint else None
@@ -243,7 +252,10 @@ class _Run:
             # --- Photons ---
             self.unfinished = None
             self.radius = bandwidth(self.radius0, self.scene.settings.alpha, index)
-            self.map = self.scene.photon_map(self.seed, index, self.map.stored if self.map else 0)
+            colour = _wavelength_sample(self.seed, index)
+            wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
+            expected = self.map.stored if self.map else 0
+            self.map = self.scene.photon_map(self.seed, index, expected, wavelengths)
             counts = dict.fromkeys(_COUNTS, 0)
             counts["photons_emitted"] = self.map.emitted
             counts["photons_stored"] = self.map.stored
@@ -252,7 +264,7 @@ class _Run:
 
             # --- Eye paths ---
             share = self.shares(index)
-            for image, taken in self._eye_pass(index, share, counts):
+            for image, taken in self._eye_pass(index, share, colour, counts):
                 self.unfinished = image, dict(counts)
                 if taken < share:
                     self._report(index, taken / share)
@@ -273,7 +285,7 @@ class _Run:
             self._report(index, 1)
             self._after_pass(index)
 
-    def _eye_pass(self, index, spp, counts):
+    def _eye_pass(self, index, spp, colour, counts):
         """Trace ``spp`` eye samples a pixel against the map, wavefront by wavefront; yields (image
         so far as film blocks hold it, samples a pixel so far)."""
         scene, sensor, map_ = self.scene, self.sensor, self.map
@@ -293,7 +305,7 @@ class _Run:
             sampler.seed(seed, pixels * count)
 
             # --- Eye paths and density estimation ---
-            ray, ray_weight, position = films.sample_rays(sensor, sampler, count)
+            ray, ray_weight, position = films.sample_rays(sensor, sampler, count, colour)
             dr.eval(ray, ray_weight, position)
             seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
             seen = scene.radiance(sampler, ray, map_, radius, seed, expected, self.clock.lap)
@@ -309,7 +321,7 @@ class _Run:
             finite = dr.all(dr.isfinite(seen.L))
             counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
             L = dr.select(finite, seen.L, 0) * ray_weight
-            splats = films.splat(film, position, L, seen.valid, count)
+            splats = films.splat(film, position, L, seen.valid, count, ray.wavelengths)
             image = splats if image is None else image + splats
             dr.eval(image)
             self.clock.lap("film")
@@ -387,6 +399,14 @@ class _Run:
             self._estimate_error()
             if self.controls.checkpoint:
                 self.controls.checkpoint.write(self._state())
+
+
+def _wavelength_sample(seed: int, index: int) -> float:
+    """Which wavelengths pass ``index`` takes: a van der Corput sequence from a random start. Each
+    sample stands for four wavelengths a quarter apart, so it needs to cover a quarter only."""
+    start = stream_seed(seed, COLOUR) / 2**32
+    sequence = int(f"{index:032b}"[::-1], 2) / 2**32
+    return (start + sequence / 4) % 1
 
 
 def _warn(statistics):

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from aniso_pm import progressive
 from aniso_pm.pilot import automatic_radius
-from aniso_pm.prepared import prepare
+from aniso_pm.prepared import Unsupported, prepare
 from aniso_pm.settings import Settings
 from aniso_pm.state import Checkpoint
 
@@ -61,8 +61,8 @@ class AnisoPhotonMapper:
      * - map
        - |string|
        - ``global``: all indirect light is read from the photon map at the first receiver.
-         ``caustic``: the map holds only light that reached a receiver over glass, mirrors and glossy
-         surfaces; everything else is path traced, and scenes without caustics have no map.
+         ``caustic``: the map holds only light that reached a receiver over glass, mirrors and
+         glossy surfaces; the rest is path traced, and scenes without caustics have no map.
          (Default: ``global``)
 
      * - final_gather
@@ -133,9 +133,9 @@ class AnisoPhotonMapper:
        - Hide directly visible emitters. (Default: |false|)
 
     Direct light comes from emitter sampling combined with BSDF sampling; everything that reaches a
-    receiver over two path segments or more comes from the photon map. Receivers are diffuse surfaces,
-    the diffuse part of ``plastic`` and ``roughplastic``, and surfaces whose roughness is at least
-    ``gather_roughness``. Photons and eye paths walk on all others, as a path tracer does.
+    receiver over two path segments or more comes from the photon map. Receivers are diffuse
+    surfaces, the diffuse part of ``plastic`` and ``roughplastic``, and surfaces whose roughness is
+    at least ``gather_roughness``. Photons and eye paths walk on all others, as ``path`` does.
 
     After ``render()`` the attribute ``statistics`` holds counts and timings. After two passes or
     more ``variance`` holds the variance of the picture (NumPy array, height × width × channels),
@@ -148,8 +148,11 @@ class AnisoPhotonMapper:
     from which it can be resumed; ``first_pass``, the number of the first pass. Pass i is the same
     whatever passes are rendered before or after it, or none.
 
-    .. warning:: Participating media, the polarized and spectral variants and derivatives are
-       refused. The program :monosp:`mitsuba` cannot load plugins written in Python; use
+    In spectral variants all photons and eye paths of a pass share four wavelengths, stratified over
+    the passes: give at least 16 passes.
+
+    .. warning:: Participating media, polarized variants and derivatives are refused. The program
+       :monosp:`mitsuba` cannot load plugins written in Python; use
        :monosp:`aniso-pm render`.
 
     .. tabs::
@@ -200,7 +203,7 @@ class AnisoPhotonMapper:
                 callback.put(name, self._exposed[name], mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys):
-        """Take over what ``mi.traverse`` has changed. Raises ValueError for a value out of range."""
+        """Take over what ``mi.traverse`` has changed; ValueError for a value out of range."""
         changed = {name: self._exposed[name][0] for name in keys if name in self._exposed}
         self.settings = self.settings.with_(**changed)
 
@@ -238,6 +241,11 @@ class AnisoPhotonMapper:
         if left is None or left[0] is not scene:
             prepared = prepare(scene, self.settings, self.hide_emitters)
             seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
+            if mi.is_spectral:
+                raise Unsupported(
+                    "aniso_pm: in spectral variants this integrator cannot be sampled by another "
+                    "one that draws wavelengths of its own; render with it directly"
+                )
             radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
             left = (scene, prepared, prepared.photon_map(seed, 0), radius)
         _, prepared, map_, radius = left
