@@ -157,6 +157,18 @@ class _Done(NamedTuple):
     counts: dict[str, int]
 
 
+class _Room:
+    """How many entries a buffer needs. It grows in steps: buffers of another size are traced anew
+    by what is frozen."""
+
+    def __init__(self):
+        self.room = 0
+
+    def seen(self, count: int):
+        if count > self.room:
+            self.room = count + count // 8
+
+
 class _Run:
     """One call of ``render``: what changes from pass to pass."""
 
@@ -171,6 +183,7 @@ class _Run:
         self.clock = _Clock()
         self.map = self.radius = self.variance = None
         self.done = _Done(None, [], dict.fromkeys((*_COUNTS, "passes"), 0))
+        self.photons, self.points = _Room(), _Room()
         self.unfinished = None  # (image, counts) of the pass that is being rendered
 
     # --- Before the first pass ---
@@ -197,6 +210,9 @@ class _Run:
             rays = camera_rays(self.sensor, self.seed)
             self.radius0 = automatic_radius(self.scene, rays, self.seed)
         self.clock.lap("pilot")
+        self.frozen = settings.passes != 1
+        if self.frozen:
+            self.scene = self.scene.frozen()
         if checkpoint:
             self.identity = digest.identity(self.scene, self.sensor, self.seed, self.shares.text)
             self.identity |= {
@@ -249,25 +265,14 @@ class _Run:
     def render_pass(self, index: int):
         """One pass, from photons to sums, and what is due after it."""
         with self.stopping.measured():
-            # --- Photons ---
-            self.unfinished = None
-            self.radius = bandwidth(self.radius0, self.scene.settings.alpha, index)
-            colour = _wavelength_sample(self.seed, index)
-            wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
-            expected = self.map.stored if self.map else 0
-            self.map = self.scene.photon_map(self.seed, index, expected, wavelengths)
-            counts = dict.fromkeys(_COUNTS, 0)
-            counts["photons_emitted"] = self.map.emitted
-            counts["photons_stored"] = self.map.stored
-            counts["photons_rejected"] = self.map.rejected
-            self.clock.lap("photons")
-
-            # --- Eye paths ---
-            share = self.shares(index)
-            for image, taken in self._eye_pass(index, share, colour, counts):
-                self.unfinished = image, dict(counts)
-                if taken < share:
-                    self._report(index, taken / share)
+            try:
+                image, counts = self._trace_pass(index)
+            except RuntimeError as error:
+                # Dr.Jit cannot record every scene (materials written in Python, for example).
+                if is_interrupt(error) or not self.frozen:
+                    raise
+                self.frozen, self.scene = False, self.scene.thawed()
+                image, counts = self._trace_pass(index)
 
             # --- One more pass is done ---
             sums = self.done.sums
@@ -285,6 +290,29 @@ class _Run:
             self._report(index, 1)
             self._after_pass(index)
 
+    def _trace_pass(self, index: int):
+        """(image as film blocks hold it, counts) of one pass."""
+        # --- Photons ---
+        self.unfinished = None
+        self.radius = bandwidth(self.radius0, self.scene.settings.alpha, index)
+        colour = _wavelength_sample(self.seed, index)
+        wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
+        self.map = self.scene.photon_map(self.seed, index, self.photons.room, wavelengths)
+        self.photons.seen(self.map.stored)
+        counts = dict.fromkeys(_COUNTS, 0)
+        counts["photons_emitted"] = self.map.emitted
+        counts["photons_stored"] = self.map.stored
+        counts["photons_rejected"] = self.map.rejected
+        self.clock.lap("photons")
+
+        # --- Eye paths ---
+        share = self.shares(index)
+        for image, taken in self._eye_pass(index, share, colour, counts):
+            self.unfinished = image, dict(counts)
+            if taken < share:
+                self._report(index, taken / share)
+        return image, counts
+
     def _eye_pass(self, index, spp, colour, counts):
         """Trace ``spp`` eye samples a pixel against the map, wavefront by wavefront; yields (image
         so far as film blocks hold it, samples a pixel so far)."""
@@ -295,7 +323,7 @@ class _Run:
         # An array, not a number: as a literal it would make every pass compile kernels of its own.
         radius = dr.opaque(mi.Float, self.radius)
         image = None
-        taken = wavefront = expected = 0
+        taken = wavefront = 0
         while taken < spp:
             sampler = sensor.sampler().clone()
             sampler.set_sample_count(min(per_wavefront, spp - taken))
@@ -308,14 +336,15 @@ class _Run:
             ray, ray_weight, position = films.sample_rays(sensor, sampler, count, colour)
             dr.eval(ray, ray_weight, position)
             seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
-            seen = scene.radiance(sampler, ray, map_, radius, seed, expected, self.clock.lap)
+            room = self.points.room
+            seen = scene.radiance(sampler, ray, map_, radius, seed, room, self.clock.lap)
             for found in seen.gathered:
                 counts["gather_points"] += dr.width(found.lane)
                 counts["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
                 counts["gather_points_bounded"] += int(dr.count(found.bounded)[0])
                 counts["gather_points_off_surface"] += int(dr.count(found.lost)[0])
                 counts["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
-            expected = sum(dr.width(found.lane) for found in seen.gathered)
+            self.points.seen(sum(dr.width(found.lane) for found in seen.gathered))
 
             # --- Into the image ---
             finite = dr.all(dr.isfinite(seen.L))

@@ -224,6 +224,7 @@ def test_a_real_interrupt_ends_in_a_picture(scene):
     import signal
 
     plugin = integrator(passes=1000)
+    mi.render(scene, integrator=integrator(passes=2), spp=2)  # compile
     handler = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
         for delay in (0.9, 1.3, 1.7):
