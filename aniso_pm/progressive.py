@@ -223,6 +223,7 @@ class _Run:
             "initial_radius": self.radius0,
             "radius_automatic": settings.initial_radius == 0,
             **self.done.counts,
+            "replayed": self.frozen,
             "relative_error": None,
             "interrupted": False,
             "seconds": self.clock.seconds,
@@ -272,6 +273,7 @@ class _Run:
                 if is_interrupt(error) or not self.frozen:
                     raise
                 self.frozen, self.scene = False, self.scene.thawed()
+                self.statistics["replayed"] = False
                 image, counts = self._trace_pass(index)
 
             # --- One more pass is done ---
