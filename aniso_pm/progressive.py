@@ -23,15 +23,13 @@ from . import digest, state
 from . import film as films
 from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .errors import is_interrupt
-from .pilot import automatic_radius, camera_rays
-from .prepared import COLOUR, EYE, PROBE, Prepared, stream_seed
-from .settings import Settings
+from .pilot import automatic_photon_count, automatic_radius, camera_rays
+from .prepared import EYE, PROBE, Prepared, stream_seed
+from .schedule import bandwidth, shares, wavelength_sample
 from .stopping import Stopping
 
 # Eye samples traced at once: bounds memory (about 250 bytes a sample).
 WAVEFRONT = 1 << 21
-# Eye samples of a pass where the number of passes is open: short against any budget.
-OPEN_PASS = 1 << 18
 # Passes that make the colours of a spectral picture right within about a percent.
 _SPECTRAL_PASSES = 16
 # What a pass counts.
@@ -76,51 +74,6 @@ class Rendered:
     map: Any
     radius: float | None
     variance: np.ndarray | None
-
-
-def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
-    """Kernel radius of pass ``index`` (0-based): r² shrinks by (i + α)/(i + 1) after pass i.
-
-    ∏ (i + α)/(i + 1) for i = 1 … index is Γ(index + 1 + α) / (Γ(1 + α) Γ(index + 2)).
-    """
-    log_area = math.lgamma(index + 1 + alpha) - math.lgamma(1 + alpha) - math.lgamma(index + 2)
-    return initial_radius * math.exp(0.5 * log_area)
-
-
-@dataclass(frozen=True)
-class Shares:
-    """Samples per pixel of each pass."""
-
-    each: int
-    one_more: range  # passes that take one sample more than the others
-    text: str
-
-    def __call__(self, index: int) -> int:
-        return self.each + (index in self.one_more)
-
-
-def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Shares:
-    """How the passes share ``spp`` samples per pixel.
-
-    With a fixed number of passes ``spp`` is the total, shared evenly. With ``passes = 0`` a pass
-    takes ``spp`` samples, but no more than make OPEN_PASS eye samples in all, and at least one.
-
-    Raises ValueError if there are fewer samples than passes, unless time or error may end them.
-    """
-    passes = settings.passes
-    if passes == 0:
-        each, rest = max(1, min(spp, OPEN_PASS // pixels)), 0
-    elif spp >= passes:
-        each, rest = divmod(spp, passes)
-    elif settings.open_ended:
-        each, rest = 1, 0
-    else:
-        raise ValueError(
-            f"aniso_pm: {spp} samples per pixel cannot be shared by {passes} passes; "
-            f'raise the sample count to {passes} or lower the parameter "passes"'
-        )
-    text = f"{spp} by {passes} from pass {first_pass}" if rest else str(each)
-    return Shares(each, range(first_pass, first_pass + rest), text)
 
 
 def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, statistics: dict):
@@ -205,10 +158,15 @@ class _Run:
         settings, checkpoint = self.scene.settings, self.controls.checkpoint
         earlier = checkpoint.start() if checkpoint else None
         known = earlier.identity if earlier else {}
+        count = settings.photon_count or known.get("photon count")
         self.radius0 = settings.initial_radius or known.get("initial radius")
-        if not self.radius0:
+        if not count or not self.radius0:
             rays = camera_rays(self.sensor, self.seed)
-            self.radius0 = automatic_radius(self.scene, rays, self.seed)
+            samples = self.shares.each * films.pixel_count(self.film)
+            count = count or automatic_photon_count(self.scene, rays, self.seed, samples)
+            self.scene = self.scene.with_(photon_count=count)
+            self.radius0 = self.radius0 or automatic_radius(self.scene, rays, self.seed)
+        self.scene = self.scene.with_(photon_count=count)
         self.clock.lap("pilot")
         self.frozen = settings.passes != 1
         if self.frozen:
@@ -217,11 +175,13 @@ class _Run:
             self.identity = digest.identity(self.scene, self.sensor, self.seed, self.shares.text)
             self.identity |= {
                 "initial radius": self.radius0,
-                "photon count": settings.photon_count,
+                "photon count": count,
             }
         self.statistics |= {
             "initial_radius": self.radius0,
             "radius_automatic": settings.initial_radius == 0,
+            "photon_count": count,
+            "photon_count_automatic": settings.photon_count == 0,
             **self.done.counts,
             "replayed": self.frozen,
             "relative_error": None,
@@ -297,7 +257,7 @@ class _Run:
         # --- Photons ---
         self.unfinished = None
         self.radius = bandwidth(self.radius0, self.scene.settings.alpha, index)
-        colour = _wavelength_sample(self.seed, index)
+        colour = wavelength_sample(self.seed, index)
         wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
         self.map = self.scene.photon_map(self.seed, index, self.photons.room, wavelengths)
         self.photons.seen(self.map.stored)
@@ -430,14 +390,6 @@ class _Run:
             self._estimate_error()
             if self.controls.checkpoint:
                 self.controls.checkpoint.write(self._state())
-
-
-def _wavelength_sample(seed: int, index: int) -> float:
-    """Which wavelengths pass ``index`` takes: a van der Corput sequence from a random start. Each
-    sample stands for four wavelengths a quarter apart, so it needs to cover a quarter only."""
-    start = stream_seed(seed, COLOUR) / 2**32
-    sequence = int(f"{index:032b}"[::-1], 2) / 2**32
-    return (start + sequence / 4) % 1
 
 
 def _warn(statistics):

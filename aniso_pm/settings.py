@@ -60,7 +60,7 @@ class Settings:
                 f'"{self.map}"; remove one of them'
             )
         self._between("gather_roughness", 0.01, 1e30)
-        self._between("photon_count", 1, 2 * 10**8)
+        self._between("photon_count", 0, 2 * 10**8, "between 1 and 2e+08, or 0 (automatic)")
         self._between("time", 0, 1e9, "0 (no limit) or a positive number of seconds")
         self._between("target_error", 0, 1e3, "0 (no target) or a positive relative error")
         endless = self.passes == 0 and not self.open_ended

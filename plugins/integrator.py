@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm import progressive
-from aniso_pm.pilot import automatic_radius
+from aniso_pm.pilot import automatic_photon_count, automatic_radius
 from aniso_pm.prepared import Unsupported, prepare
 from aniso_pm.settings import Settings
 from aniso_pm.state import Checkpoint
@@ -78,7 +78,9 @@ class AnisoPhotonMapper:
 
      * - photon_count
        - |int|
-       - Light paths per pass. (Default: 250000)
+       - Light paths per pass. 0 chooses as many as are about as much work as the eye samples of a
+         pass, between 10,000 and 5 million; the choice is in ``statistics["photon_count"]``.
+         (Default: 250000)
 
      * - passes
        - |int|
@@ -246,6 +248,9 @@ class AnisoPhotonMapper:
                     "aniso_pm: in spectral variants this integrator cannot be sampled by another "
                     "one that draws wavelengths of its own; render with it directly"
                 )
+            if self.settings.photon_count == 0:
+                count = automatic_photon_count(prepared, ray, seed, dr.width(ray))
+                prepared = prepared.with_(photon_count=count)
             radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
             left = (scene, prepared, prepared.photon_map(seed, 0), radius)
         _, prepared, map_, radius = left

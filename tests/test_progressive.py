@@ -11,7 +11,7 @@ import matrix
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import progress, progressive
+from aniso_pm import progress, progressive, schedule
 from aniso_pm.accumulate import Sums, mean_and_variance, relative_standard_error
 from aniso_pm.settings import Settings
 from aniso_pm.state import Checkpoint, State, StateError, describe, merge
@@ -53,7 +53,7 @@ def close(a, b):
 def test_bandwidth_is_the_product_of_the_ratios():
     area = 1.0
     for i in range(300):
-        assert progressive.bandwidth(2.0, 2 / 3, i) == pytest.approx(2 * area**0.5, rel=1e-9)
+        assert schedule.bandwidth(2.0, 2 / 3, i) == pytest.approx(2 * area**0.5, rel=1e-9)
         area *= (i + 1 + 2 / 3) / (i + 2)
 
 
@@ -96,8 +96,36 @@ def test_passes_differ_from_each_other_and_between_seeds():
     ],
 )
 def test_samples_are_shared_evenly_and_open_ends_take_short_passes(parameters, spp, pixels, each):
-    shares = progressive.shares(Settings(**parameters), spp, pixels)
+    shares = schedule.shares(Settings(**parameters), spp, pixels)
     assert [shares(i) for i in range(len(each))] == each
+
+
+def test_automatic_photon_count_balances_the_work_of_a_pass():
+    """Twice the eye samples, twice the light paths; as counted by hand from the statistics."""
+    scene = load(64)
+    chosen = {}
+    for spp in (16, 32):
+        plugin = integrator(photon_count=0)
+        render(scene, plugin, spp)
+        s = plugin.statistics
+        assert s["photon_count_automatic"] and s["photon_count"] == s["photons_emitted"]
+        light = s["photons_emitted"] + s["photons_stored"]
+        assert light == pytest.approx(s["eye_samples"] + s["gather_points"], rel=0.1)
+        chosen[spp] = s["photon_count"]
+    assert chosen[32] == pytest.approx(2 * chosen[16], rel=0.06)  # two digits
+
+
+def test_automatic_photon_count_is_kept_when_resuming(tmp_path):
+    path = tmp_path / "a.state"
+    scene = load(48)
+    render(scene, integrator(photon_count=0, passes=2), 8, checkpoint=Checkpoint(path))
+    state = State.load(path)
+    chosen = state.identity["photon count"]
+    state.identity["photon count"] = chosen + 1
+    state.save(path)
+    plugin = integrator(photon_count=0, passes=3)
+    render(scene, plugin, 12, checkpoint=Checkpoint(path, resume=True))
+    assert plugin.statistics["photons_emitted"] == 3 * chosen + 1
 
 
 # --- Variance ---
@@ -534,6 +562,30 @@ def test_a_thousand_passes_need_no_more_memory_than_fifty():
 def _resident() -> int:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return 4096 * pages
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.01, 1, 1000])
+def test_automatic_radius_suits_a_coin_and_a_stadium(scale):
+    """Sixty photons a kernel in the median of the light. In a room of 24 square units, evenly lit,
+    that is a kernel area π(2r)² = 24 · 60/photons; light is brightest where kernels are smaller."""
+    definition = room(size=16)
+    T = mi.ScalarTransform4f
+    for name, part in definition.items():
+        if isinstance(part, dict) and "to_world" in part:
+            if name == "sensor":
+                origin, target = [0, 0, 0.97 * scale], [0, -0.15 * scale, 0]
+                part["to_world"] = T().look_at(origin=origin, target=target, up=[0, 1, 0])
+                part["near_clip"], part["far_clip"] = 1e-3 * scale, 1e3 * scale
+            else:
+                part["to_world"] = T().scale(scale) @ part["to_world"]
+    plugin = integrator(initial_radius=0.0, photon_count=50_000)
+    render(mi.load_dict(definition), plugin, 4)
+    s = plugin.statistics
+    print(f"scale {scale}: radius {s['initial_radius']:.4g}")
+    even = math.sqrt(24 * 60 / s["photons_stored"] / (4 * math.pi))
+    assert 0.5 * even < s["initial_radius"] / scale < even
+    assert 30 < s["photons_gathered"] / s["gather_points"] < 120
 
 
 @pytest.mark.slow
