@@ -233,7 +233,10 @@ def merge(
         raise InputError(f"{error.filename}: {error.strerror}") from error
 
     _set_variant(total.identity["variant"])
-    film = films.from_description(total.film)
+    try:
+        film = films.from_description(total.film)
+    except ValueError as error:
+        raise InputError(str(error)) from error
     films.show_array(film, total.arrays["first"])
     record = {
         "merged": list(loaded),

@@ -94,6 +94,7 @@ def describe(film) -> dict[str, Any]:
     long = {"y": "luminance", "ya": "luminance_alpha"}
     formats = {name: long.get(value, value) for name, value in formats.items()}
     return {
+        "kind": film.class_name(),
         "size": [int(n) for n in film.size()],
         "crop_size": [int(n) for n in film.crop_size()],
         "crop_offset": [int(n) for n in film.crop_offset()],
@@ -102,7 +103,13 @@ def describe(film) -> dict[str, Any]:
 
 
 def from_description(description: dict[str, Any]):
-    """A film without a scene, for the sums of one that was described by :func:`describe`."""
+    """A film without a scene, for the sums of one that was described by :func:`describe`. Raises
+    ValueError for other kinds than hdrfilm."""
+    if description["kind"] != "HDRFilm":
+        raise ValueError(
+            f"aniso_pm: the passes were rendered for a {description['kind']}; only those for an "
+            "hdrfilm can be developed without their scene"
+        )
     (width, height), crop = description["size"], description["crop_size"]
     offset = description["crop_offset"]
     film = mi.load_dict(

@@ -122,7 +122,10 @@ def _with_layers(bitmap, layers: Mapping[str, Any]):
     names = [part.name for part in bitmap.struct_()]
     for layer, values in layers.items():
         parts.append(np.asarray(values, dtype=np.float32))
-        names += [f"{layer}.{channel}" for channel in "RGBA"[: values.shape[2]]]
+        count = values.shape[2]
+        # Sums are R, G, B, whatever the film makes of them, unless it is a spectral one.
+        own = [name for name in names if "." not in name][:count]
+        names += [f"{layer}.{channel}" for channel in ("RGBA"[:count] if count <= 4 else own)]
     pixels = np.concatenate(parts, axis=2)
     return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names)
 
