@@ -1,11 +1,12 @@
 """Error against passes: ``python scenes/measure_convergence.py`` makes pictures/convergence.svg.
 
-Each scene is rendered several times with different seeds, small passes, and the picture is kept
-after 1, 4, 16, … passes. Errors count relative to R² + 0.01. With the reference in two independent
-halves R1, R2 and pictures I, means over pixels and colours of
+Each scene is rendered with several seeds in small passes, and the picture is kept after 1, 4, 16, …
+passes. Errors count relative to R² + 0.01, R the mean of the reference over a block of pixels: that
+of a single pixel is noisy, and its noise would favour dark pixels. With the reference in two
+independent halves R1, R2 and pictures I, means over pixels and colours of
 
     MSE    the mean over seeds of (I − R1)(I − R2)
-    bias²  (A − R1)(B − R2), with A and B the means over two halves of the seeds, both ways round
+    bias²  the mean over pairs of different seeds of (I − R1)(I' − R2)
 
 have no noise in their expectation, neither the reference's nor (bias²) that of the pictures. What
 scatters is shown by a bootstrap over seeds and blocks of pixels: 95 % intervals. A point within
@@ -31,7 +32,8 @@ WINDOWS = {
     "fry_pan": (150, 140, 96, 72),
     "glass_balls": (40, 25, 96, 72),
 }
-COUNTS = (1, 4, 16, 64, 256)
+# Number of passes: seeds. Few passes are noisy and cheap.
+SEEDS = {1: 48, 4: 48, 16: 24, 64: 7, 256: 4}
 BLOCK = 8  # pixels
 RESAMPLED = 400
 
@@ -93,75 +95,84 @@ def pictures(scene, counts, seed, parameters, spp):
     return np.array(kept)
 
 
-def blocks(values):
-    """Sums over blocks of pixels and colours: (..., y, x, 3) → (..., blocks)."""
-    *rest, height, width, colours = values.shape
-    shape = (*rest, height // BLOCK, BLOCK, width // BLOCK, BLOCK, colours)
-    return values.reshape(shape).mean((-1, -2, -4)).reshape(*rest, -1)
+def products(images, halves):
+    """Means over blocks of pixels of the products of the errors of any two pictures, each against
+    another half of the reference: (blocks, seeds, seeds). images: (seeds, y, x, 3)."""
+    reference = by_block(np.mean(halves, axis=0)[None]).mean(-1)[..., None]
+    scale = (reference**2 + 0.01) ** -0.5
+    first, second = (scale * by_block(images - half) for half in halves)
+    return first @ second.transpose(0, 2, 1) / first.shape[-1]
 
 
-def measure(images, halves):
-    """(MSE, bias², variance) against passes. images: (seeds, counts, y, x, 3)."""
-    weight = 1 / (np.mean(halves, axis=0) ** 2 + 0.01)
-    errors = [images - half for half in halves]
-    squares = blocks(weight * errors[0] * errors[1])  # (seeds, counts, blocks)
-    seeds, _, n = squares.shape
-    # Products of the errors of different seeds, (counts, blocks) for each pair.
-    pairs = {
-        (i, j): blocks(weight * errors[0][i] * errors[1][j])
-        for i in range(seeds)
-        for j in range(seeds)
-        if i != j
-    }
+def by_block(values):
+    """(n, y, x, 3) → (blocks, n, pixels and colours of a block)."""
+    n, height, width, colours = values.shape
+    values = values.reshape(n, height // BLOCK, BLOCK, width // BLOCK, BLOCK, colours)
+    return values.transpose(1, 3, 0, 2, 4, 5).reshape(-1, n, BLOCK * BLOCK * colours)
 
-    def estimate(chosen, where):
-        mse = squares[chosen][..., where].mean((0, 2))
-        products = [pairs[i, j] for i in chosen for j in chosen if i != j]
-        return mse, np.mean(products, axis=0)[..., where].mean(-1)
 
+def measure(pictures_by_count, halves):
+    """(MSE, bias²) against passes, as Curves. pictures_by_count: arrays (seeds, y, x, 3)."""
+    tables = [products(images, halves) for images in pictures_by_count]
     rng = np.random.default_rng(0)
-    everything = estimate(np.arange(seeds), np.arange(n))
+
+    def estimate(table, where, times):
+        """Both, from some blocks, with each seed taken so many times."""
+        mean = table[where].mean(0)
+        own = np.diag(mean) @ times / times.sum()
+        pairs = np.outer(times, times) * (1 - np.eye(len(times)))
+        return own, (pairs * mean).sum() / pairs.sum()
+
+    blocks = len(tables[0])
+    value = [estimate(t, np.arange(blocks), np.ones(t.shape[1])) for t in tables]
     resampled = []
     for _ in range(RESAMPLED):
-        where = rng.integers(0, n, n)
-        chosen = rng.integers(0, seeds, seeds)
-        while len(set(chosen)) < 2:
-            chosen = rng.integers(0, seeds, seeds)
-        resampled.append(estimate(chosen, where))
-    mse, bias2 = (
-        Curve(value, np.array([r[k] for r in resampled])) for k, value in enumerate(everything)
-    )
-    return mse, bias2, everything[0] - everything[1]
+        where = rng.integers(0, blocks, blocks)
+        row = []
+        for table in tables:
+            seeds = table.shape[1]
+            times = np.zeros(seeds)
+            while (times > 0).sum() < 2:
+                times = np.bincount(rng.integers(0, seeds, seeds), minlength=seeds)
+            row.append(estimate(table, where, times))
+        resampled.append(row)
+    value, resampled = np.array(value), np.array(resampled)
+    return tuple(Curve(value[:, k], resampled[:, :, k]) for k in (0, 1))
 
 
-def run(names, seeds, photons, spp):
+def run(names, photons, spp):
     results = {}
+    counts = tuple(SEEDS)
     for name in names:
         scene, halves = load(name)
-        parameters = {"photon_count": photons}
-        images = []
-        for seed in range(seeds):
-            images.append(pictures(scene, COUNTS, seed, parameters, spp))
-            print(f"\r{name}: seed {seed + 1} of {seeds}", end="", flush=True)
+        kept = {count: [] for count in counts}
+        for seed in range(max(SEEDS.values())):
+            wanted = [count for count in counts if seed < SEEDS[count]]
+            images = pictures(scene, wanted, seed, {"photon_count": photons}, spp)
+            for count, image in zip(wanted, images, strict=True):
+                kept[count].append(image)
+            print(f"\r{name}: seed {seed + 1} of {max(SEEDS.values())}", end="", flush=True)
         print()
-        mse, bias2, variance = measure(np.array(images), halves)
-        weight = 1 / (np.mean(halves, axis=0) ** 2 + 0.01)
-        floor = float(np.mean(weight * ((halves[0] - halves[1]) / 2) ** 2))
+        kept = [np.array(images) for images in kept.values()]
+        mse, bias2 = measure(kept, halves)
+        reference = np.mean(halves, axis=0)
+        noise = by_block((halves[0] - halves[1])[None] / 2) ** 2
+        level = by_block(reference[None]).mean(-1, keepdims=True)
+        own = np.mean(noise / (level**2 + 0.01))
         results[name] = {
-            "passes": COUNTS,
+            "passes": counts,
+            "seeds": list(SEEDS.values()),
             "photons": photons,
             "samples": spp,
-            "seeds": seeds,
-            "variance of the reference": floor,
-            "energy": [float(i.mean() / np.mean(halves)) for i in np.mean(images, axis=0)],
-            "variance": variance.tolist(),
+            "variance of the reference": float(own),
+            "energy": [float(images.mean() / reference.mean()) for images in kept],
         }
         for label, curve in (("MSE", mse), ("bias²", bias2)):
             results[name][label] = {
                 "value": curve.value.tolist(),
                 "interval": curve.interval.tolist(),
                 "clear": curve.clear.tolist(),
-                "slope": curve.slope(COUNTS),
+                "slope": curve.slope(counts),
             }
         show(name, results[name])
     return results
@@ -203,7 +214,7 @@ def plot(results, path):
             lw=1,
             label="variance of the reference",
         )
-        ax.set(xscale="log", yscale="log", title=name, xlabel="passes")
+        ax.set(xscale="log", yscale="log", title=name, xlabel="passes", ylim=(1e-4, 1))
         ax.set_xticks(counts, [str(n) for n in counts])
         ax.minorticks_off()
         ax.legend(fontsize=7)
@@ -216,15 +227,14 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--reference", choices=list(WINDOWS), help="render this reference, no more")
     parser.add_argument("--scenes", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
-    parser.add_argument("--seeds", type=int, default=6)
-    parser.add_argument("--photons", type=int, default=20_000, help="light paths per pass")
+    parser.add_argument("--photons", type=int, default=100_000, help="light paths per pass")
     parser.add_argument("--spp", type=int, help="samples per pass (2), or of the reference (32768)")
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     if arguments.reference:
         make_reference(arguments.reference, arguments.spp or 32768)
     else:
-        measured = run(arguments.scenes, arguments.seeds, arguments.photons, arguments.spp or 2)
+        measured = run(arguments.scenes, arguments.photons, arguments.spp or 2)
         (HERE / "pictures" / "convergence.json").write_text(
             json.dumps(measured, indent=1, ensure_ascii=False) + "\n"
         )

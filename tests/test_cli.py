@@ -317,9 +317,12 @@ def test_killed_at_any_moment_and_resumed_it_ends_in_the_same_picture(scene, tmp
     random = np.random.default_rng(kills)
     done = []
     for _ in range(kills):
+        # From before the first import to the midst of a write; the first time, wait for a state.
         program = process(*arguments, cwd=tmp_path)
+        while not (tmp_path / "a.state").exists() and program.poll() is None:
+            time.sleep(0.1)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            program.wait(timeout=random.uniform(1.5, 4.0))
+            program.wait(timeout=random.uniform(0, 4.0))
         program.kill()
         program.communicate()
         with contextlib.suppress(FileNotFoundError):
