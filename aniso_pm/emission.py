@@ -62,13 +62,28 @@ class Emission:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
         if self.textured:  # the ray does not tell where on the texture it starts: look back
             δ = 1e-3 * (1 + dr.max(dr.abs(ray.o)))
-            si = self.scene.ray_intersect(mi.Ray3f(ray.o + ray.d * δ, -ray.d, 2 * δ, ray.time, []))
+            back = mi.Ray3f(ray)
+            back.o, back.d, back.maxt = ray.o + ray.d * δ, -ray.d, 2 * δ
+            si = self.scene.ray_intersect(back)
         si.wi = dr.select(emitter.is_environment(), ray.d, mi.Vector3f(0, 0, 1))
-        _, drawn = emitter.sample_wavelengths(si, u, active)
+        si.wavelengths = ray.wavelengths
+        # Environment maps draw from D65, and ask for texture coordinates that are not ours to know.
+        white = mi.load_dict({"type": "d65"})
+        white = white.sample_spectrum(si, mi.sample_shifted(u))[1] / white.eval(si)
+        drawn = dr.sum(dr.dispatch(emitter, _spectrum_over_density, si, u, white, active))
         si.wavelengths = wavelengths
         radiance = dr.dispatch(emitter, _spectrum, si, active)
-        total = dr.sum(drawn)
-        return radiance * dr.select(total > 0, dr.sum(flux) / total, 0)
+        return radiance * dr.select(drawn > 0, dr.sum(flux) / drawn, 0)
+
+
+def _spectrum_over_density(emitter, si, u, white, active):
+    """L(λ')/p(λ') of the wavelengths si.wavelengths that the emitter has drawn with u.
+    white: 1/p(λ') where the emitter draws from D65."""
+    if emitter is None:
+        return mi.Spectrum(0)
+    if emitter.class_name() == "EnvironmentMapEmitter":
+        return emitter.eval(si, active) * white
+    return emitter.sample_wavelengths(si, u, active)[1]
 
 
 def _spectrum(emitter, si, active):

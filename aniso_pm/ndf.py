@@ -14,6 +14,8 @@ ln G = ln cos θ − λ sin²θ = −(λ + 1/2) θ² + O(θ⁴) along the tangen
 
 from __future__ import annotations
 
+from functools import cache
+
 import drjit as dr
 import mitsuba as mi
 
@@ -61,21 +63,24 @@ def asg_from_roughness(alpha_u, alpha_v, distribution="beckmann", match="peak") 
 # --- Reading the roughness of a Mitsuba BSDF ---------------------------------------------------
 
 
-def children(bsdf) -> dict:
-    """Name → object or value of everything a BSDF hands to ``mi.traverse``, one level deep."""
-
-    class Collect(mi.TraversalCallback):
-        def __init__(self):
-            super().__init__()
-            self.found = {}
-
-        def put(self, name, value, flags, cpptype=None):
-            plain = cpptype is not None  # a number inside the BSDF, behind a pointer
-            self.found[name] = mi.get_property(value, cpptype, bsdf) if plain else value
-
-    collect = Collect()
-    bsdf.traverse(collect)
+def children(node) -> dict:
+    """Name → object or value of everything an object hands to ``mi.traverse``, one level deep."""
+    collect = _collector(mi.variant())()
+    # Not by a closure: classes live until the garbage collector comes, and would keep the node of a
+    # scene that is gone. Dr.Jit would go on calling it.
+    collect.node, collect.found = node, {}
+    node.traverse(collect)
     return collect.found
+
+
+@cache
+def _collector(variant: str):
+    class Collect(mi.TraversalCallback):
+        def put(self, name, value, flags, cpptype=None):
+            plain = cpptype is not None  # a number inside the object, behind a pointer
+            self.found[name] = mi.get_property(value, cpptype, self.node) if plain else value
+
+    return Collect
 
 
 def nested_bsdfs(found: dict) -> list:

@@ -20,6 +20,7 @@ class Needs:
                vertex, and caustics exist.
     receivers  surfaces that photons are stored on.
     general    receivers that are not Lambertian.
+    unreadable glossy surfaces whose roughness cannot be read: kernels behind them are discs.
     unseen     emitters whose direct light only photons can find.
     """
 
@@ -27,6 +28,7 @@ class Needs:
     chains: list[str] = field(default_factory=list)
     receivers: list[str] = field(default_factory=list)
     general: list[str] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
 
 
@@ -39,7 +41,7 @@ def read_scene(scene, gather_roughness: float) -> Needs:
     needs = Needs()
     for emitter in scene.emitters():
         if only_photons_see(emitter):
-            needs.unseen.append(f"{emitter.id()}: {emitter.class_name()}")
+            needs.unseen.append(emitter_name(emitter))
     seen = set()
     for shape in scene.shapes():
         name = shape.id() or shape.class_name()
@@ -57,7 +59,7 @@ def read_scene(scene, gather_roughness: float) -> Needs:
         if bsdf is None or bsdf.ptr in seen:
             continue
         seen.add(bsdf.ptr)
-        evidence = f"{name}: {bsdf.class_name()}"
+        evidence = f"{name}: {_describe(bsdf)}"
         if may_gather(bsdf, gather_roughness):
             needs.receivers.append(evidence)
         if is_lambertian(bsdf):
@@ -65,15 +67,31 @@ def read_scene(scene, gather_roughness: float) -> Needs:
         if may_gather(bsdf, gather_roughness):
             needs.general.append(evidence)
         needs.chains.append(evidence)
+        glossy = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+        if glossy and roughness_source(bsdf) is None:
+            needs.unreadable.append(evidence)
         if _may_be_anisotropic(bsdf):
             needs.lobes.append(evidence)
-        if needs.unseen and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy):
+        if needs.unseen and glossy:
             raise ValueError(
                 f'aniso_pm: emitter "{needs.unseen[0]}" casts parallel light that glossy surfaces '
                 f'("{evidence}") cannot be lit by in this integrator; use "directional", "spot" or '
                 '"area" instead'
             )
     return needs
+
+
+def emitter_name(emitter) -> str:
+    return f"{emitter.id()}: {emitter.class_name()}".removeprefix(": ")
+
+
+def _describe(bsdf) -> str:
+    """Class names of a tree of BSDFs: TwoSidedBRDF(RoughConductor)."""
+    python = type(bsdf).__module__.split(".")[0] != "mitsuba"
+    name = type(bsdf).__name__ if python else bsdf.class_name()
+    distinct = {child.ptr: child for child in nested_bsdfs(children(bsdf))}  # twosided: twice one
+    nested = ", ".join(_describe(child) for child in distinct.values())
+    return f"{name}({nested})" if nested else name
 
 
 def _may_be_anisotropic(bsdf) -> bool:

@@ -135,6 +135,11 @@ def _flux_width() -> int:
     return 1 if dr.size_v(mi.Spectrum) == 1 else 4
 
 
+def flux_bytes() -> int:
+    """Of the flux of one photon in the current variant."""
+    return 4 * _flux_width()
+
+
 def _packet():
     """Array type of one photon's flux: a power of two of channels is gathered at once."""
     return mi.Vector1f if _flux_width() == 1 else mi.Vector4f

@@ -105,6 +105,12 @@ class Prepared:
         return wanted and self.emission is not None and (self.deep or not caustics_only)
 
     @property
+    def bytes_per_photon(self) -> int:
+        """Of a map at rest, index included: position and word, flux, direction, and one box of 32
+        bytes for every leaf and every inner node (2 nodes for 4 to 8 photons: 12 bytes)."""
+        return 16 + photons.flux_bytes() + (4 if self.needs.general else 0) + 12
+
+    @property
     def gather_depth(self) -> int:
         """The limit that ``density.estimate`` has to test photons against: none if there is no
         limit, or if all gather points lie at the first vertex and the map keeps the limit. Paths of

@@ -33,7 +33,7 @@ class Row:
     objects    shapes added to the room.
     drop       shapes of the room left out.
     reference  integrator that converges on it.
-    spp        samples per pixel of a reference render; ours takes a quarter.
+    spp        samples per pixel of a reference render.
     differs    how far Mitsuba's own integrators differ there, if they do (a share).
     """
 
@@ -184,7 +184,9 @@ def rows():
         "spot, diffuse": Row("spot", block(diffuse)),
         "projector, diffuse": Row("projector", block(diffuse)),
         "directional, diffuse": Row("directional", block(diffuse)),
-        "directionalarea, diffuse": Row("directionalarea", block(diffuse), reference="ptracer", spp=65536),
+        "directionalarea, diffuse": Row(
+            "directionalarea", block(diffuse), reference="ptracer", spp=65536
+        ),
         "constant, diffuse": Row("constant", block(diffuse)),
         "envmap, diffuse": Row("envmap", block(diffuse)),
         "sunsky, diffuse": Row("sunsky", block(diffuse)),
@@ -197,7 +199,9 @@ def rows():
         "brushed GGX conductor": Row(objects=ball(brushed | {"distribution": "ggx"})),
         "dielectric": Row(objects=ball(glass), spp=32768),
         "thindielectric": Row(objects=ball({"type": "thindielectric"}), spp=16384),
-        "roughdielectric 0.2": Row(objects=ball({"type": "roughdielectric", "alpha": 0.2}), spp=16384),
+        "roughdielectric 0.2": Row(
+            objects=ball({"type": "roughdielectric", "alpha": 0.2}), spp=16384
+        ),
         "brushed dielectric": Row(
             objects=ball({"type": "roughdielectric", "alpha_u": 0.1, "alpha_v": 0.4}), spp=16384
         ),
@@ -207,23 +211,39 @@ def rows():
         "principled": Row(objects=ball(satin)),
         "brushed principled": Row(objects=ball(satin | {"metallic": 1.0, "anisotropic": 0.9})),
         "principled glass": Row(
-            objects=ball({"type": "principled", "roughness": 0.4, "spec_trans": 0.9, "eta": 1.4}), spp=16384
+            objects=ball({"type": "principled", "roughness": 0.4, "spec_trans": 0.9, "eta": 1.4}),
+            spp=16384,
         ),
-        "principledthin": Row(objects=ball({"type": "principledthin", "roughness": 0.5, "diff_trans": 0.8})),
+        "principledthin": Row(
+            objects=ball({"type": "principledthin", "roughness": 0.5, "diff_trans": 0.8})
+        ),
         "hair": Row(objects=ball({"type": "hair"}, radius=0.3)),
         "null": Row(objects=ball({"type": "null"})),
-        "asgconductor": Row(objects=plate({"type": "asgconductor", "material": "Al", "alpha_u": 0.05, "alpha_v": 0.3})),
+        "asgconductor": Row(
+            objects=plate(
+                {"type": "asgconductor", "material": "Al", "alpha_u": 0.05, "alpha_v": 0.3}
+            )
+        ),
         "textured roughness": Row(
-            objects=plate(brushed | {"alpha_u": image((2, 2, 1), 1, True, 0.1, 0.5), "alpha_v": 0.3})
+            objects=plate(
+                brushed | {"alpha_u": image((2, 2, 1), 1, True, 0.1, 0.5), "alpha_v": 0.3}
+            )
         ),
         # --- wrappers ---
         "twosided blend of diffuse and brushed": Row(objects=plate(blend(diffuse, brushed))),
         "blend of diffuse and mirror": Row(objects=ball(blend(diffuse, mirror))),
-        "mask of brushed": Row(objects=plate({"type": "mask", "opacity": 0.6, "b": {"type": "twosided", "b": brushed}}, both=False)),
+        "mask of brushed": Row(
+            objects=plate(
+                {"type": "mask", "opacity": 0.6, "b": {"type": "twosided", "b": brushed}},
+                both=False,
+            )
+        ),
         "mask of diffuse": Row(objects=ball(mask(diffuse)), reference="prb"),
         "bumpmap of roughplastic": Row(objects=plate(bump(glossy))),
         "normalmap of roughconductor": Row(objects=plate(normalmap(rough | {"alpha": 0.2}))),
-        "bump of mask of twosided": Row(objects=plate(bump(mask(matt)), both=False), reference="prb"),
+        "bump of mask of twosided": Row(
+            objects=plate(bump(mask(matt)), both=False), reference="prb"
+        ),
         # --- geometry ---
         "instanced plastic": Row(
             objects={
@@ -234,24 +254,51 @@ def rows():
         ),
         "analytic shapes": Row(
             objects={
-                "disk": {"type": "disk", "to_world": T().translate([-0.4, -0.5, 0]).rotate([1, 0, 0], -70).scale(0.4), "bsdf": {"type": "twosided", "b": brushed}},
-                "tube": {"type": "cylinder", "p0": [0.4, -1, 0], "p1": [0.4, 0, -0.3], "radius": 0.2, "bsdf": {"type": "twosided", "b": diffuse}},
+                "disk": {
+                    "type": "disk",
+                    "to_world": T().translate([-0.4, -0.5, 0]).rotate([1, 0, 0], -70).scale(0.4),
+                    "bsdf": {"type": "twosided", "b": brushed},
+                },
+                "tube": {
+                    "type": "cylinder",
+                    "p0": [0.4, -1, 0],
+                    "p1": [0.4, 0, -0.3],
+                    "radius": 0.2,
+                    "bsdf": {"type": "twosided", "b": diffuse},
+                },
             }
         ),
         # --- paths ---
         "two brushed plates": Row(
-            objects=plate(brushed, "left plate", -0.5, 40) | plate(brushed, "right plate", 0.55, -40)
+            objects=plate(brushed, "left plate", -0.5, 40)
+            | plate(brushed, "right plate", 0.55, -40)
         ),
-        "mirror that sees a caustic": Row(objects=ball(glass, -0.5, 0.3) | plate(mirror, turn=25), spp=32768),
+        "mirror that sees a caustic": Row(
+            objects=ball(glass, -0.5, 0.3) | plate(mirror, turn=25), spp=32768
+        ),
         "roughplastic floor under glass": Row(objects=floor(glossy) | ball(glass), spp=32768),
         "rough metal floor under glass": Row(objects=floor(rough) | ball(glass), spp=32768),
         "light inside glass": Row(
             "sphere",
-            {"shell": {"type": "sphere", "center": [0.4, 0.5, 0], "radius": 0.3, "bsdf": {"type": "dielectric"}}},
+            {
+                "shell": {
+                    "type": "sphere",
+                    "center": [0.4, 0.5, 0],
+                    "radius": 0.3,
+                    "bsdf": {"type": "dielectric"},
+                }
+            },
             spp=32768,
         ),
         "lamp behind a thin wall": Row(
-            "sphere", {"wall": {"type": "rectangle", "to_world": T().translate([0.1, 0, 0]).rotate([0, 1, 0], 80), "bsdf": {"type": "twosided", "b": diffuse}}}
+            "sphere",
+            {
+                "wall": {
+                    "type": "rectangle",
+                    "to_world": T().translate([0.1, 0, 0]).rotate([0, 1, 0], 80),
+                    "bsdf": {"type": "twosided", "b": diffuse},
+                }
+            },
         ),
         # --- materials under other lights ---
         "rough metal under a point": Row("point", ball(rough)),
@@ -260,7 +307,7 @@ def rows():
         "principled under an envmap": Row("envmap", ball(satin)),
         "mask under a constant": Row("constant", ball(mask(diffuse)), reference="prb"),
         "bumped blend under several": Row("several", plate(bump(blend(diffuse, rough)))),
-    }  # fmt: skip
+    }
     return table
 
 
@@ -279,10 +326,11 @@ def mean_and_error(scene, integrator, spp, seeds):
     return float(np.mean(values)), float(np.std(values, ddof=1) / len(values) ** 0.5)
 
 
-def compare(row, use, expected, seeds=range(8), passes=8, **more):
-    """(ratio of our energy to the reference's, standard error of both together)."""
-    integrator = PHOTON_MAPPER | USES[use] | {"passes": passes} | more
-    mean, error = mean_and_error(make(row), integrator, max(row.spp // 4, passes), seeds)
+def compare(row, use, expected, seeds=range(5), passes=4, share=8):
+    """(ratio of our energy to the reference's, standard error of both together). We take 1/share
+    of the reference's samples per pixel."""
+    integrator = PHOTON_MAPPER | USES[use] | {"passes": passes}
+    mean, error = mean_and_error(make(row), integrator, max(row.spp // share, passes), seeds)
     return mean / expected[0], math.hypot(error, expected[1]) / expected[0]
 
 
@@ -295,6 +343,9 @@ def main():
     known = json.loads(REFERENCE.read_text()) if REFERENCE.exists() else {}
     for name, row in rows().items():
         if arguments.names and name not in arguments.names:
+            continue
+        if arguments.compare and name not in known:
+            print(f"{name:38s} has no reference yet")
             continue
         if arguments.compare:
             results = {use: compare(row, use, known[name]) for use in USES}

@@ -444,10 +444,43 @@ def test_mono_sees_the_luminance_of_grey_scenes(variant_llvm_mono):
     assert image.mean() == pytest.approx(path.mean(), rel=0.03)
 
 
-def test_spectral_is_refused_with_one_sentence(variant_llvm_spectral):
-    scene = mi.load_dict(room(size=4))
-    with pytest.raises(ValueError, match='variant "llvm_ad_spectral" is not supported'):
-        integrator().render(scene, spp=1)
+@pytest.mark.parametrize("emitter", ["area", "textured", "point", "envmap"])
+def test_spectral_agrees_with_path(variant_llvm_spectral, emitter):
+    """The lamps' spectra differ and the rays' wavelengths are not the lamps' own: a wrong spectrum
+    or pairing shows in the colour."""
+    tungsten = {
+        "type": "irregular",
+        "wavelengths": "360, 500, 600, 700, 830",
+        "values": "0.2, 1, 3, 6, 8",
+    }
+    definition = room(size=8)
+    if emitter == "area":
+        definition["light"]["emitter"]["radiance"] = tungsten
+    elif emitter == "textured":
+        texels = np.random.default_rng(2).uniform(0, 9, (4, 4, 3)).astype(np.float32)
+        radiance = {"type": "bitmap", "data": mi.TensorXf(texels), "raw": True}
+        definition["light"]["emitter"]["radiance"] = radiance | {"raw": False}
+        definition["lamp"] = {"type": "point", "position": [0, 0.5, 0], "intensity": tungsten}
+    elif emitter == "point":
+        definition["light"] = {"type": "point", "position": [0, 0.5, 0], "intensity": tungsten}
+    else:
+        sky = np.full((8, 16, 3), 0.4, np.float32)
+        sky[1:3, 3:6] = [9, 4, 1]
+        definition["light"] = {"type": "envmap", "bitmap": mi.Bitmap(sky)}
+        del definition["ceiling"]
+    scene = mi.load_dict(definition)
+    ours = integrator(photon_count=20_000, passes=32, initial_radius=0.05)
+    image = array(mi.render(scene, integrator=ours, spp=512)).mean((0, 1))
+    path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=4096))
+    np.testing.assert_allclose(image, path.mean((0, 1)), rtol=0.03)
+
+
+def test_spectral_refuses_what_cannot_share_wavelengths(variant_llvm_spectral):
+    definition = room(size=4)
+    texture = {"type": "bitmap", "data": mi.TensorXf(np.ones((2, 2, 3), np.float32))}
+    definition["light"] = {"type": "projector", "irradiance": texture}
+    with pytest.raises(ValueError, match="is a projector.*use an RGB variant"):
+        integrator().render(mi.load_dict(definition), spp=1)
 
 
 def test_scalar_variants_are_refused_at_loading():
