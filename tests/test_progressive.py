@@ -565,6 +565,22 @@ def _resident() -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["teapot", "fry_pan", "glass_balls"])
+def test_later_passes_cost_python_less_than_20_ms(name):
+    """Processor time of the main thread, whatever else the machine does: tracing, launching and
+    what it computes itself while it waits."""
+    path = Path(__file__).parents[1] / "scenes" / f"{name}.xml"
+    scene = mi.load_file(str(path), width="32", height="24", optimize=False)
+    plugin = integrator(passes=40, photon_count=1000)
+    times = []
+    plugin.callback = lambda *_: times.append(time.thread_time())
+    render(scene, plugin, 40)
+    typical = np.median(np.diff(times))
+    print(f"{name}: {1e3 * typical:.1f} ms a pass")
+    assert plugin.statistics["replayed"] and typical < 0.02
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.01, 1, 1000])
 def test_automatic_radius_suits_a_coin_and_a_stadium(scale):
     """Sixty photons a kernel in the median of the light. In a room of 24 square units, evenly lit,
