@@ -1,8 +1,9 @@
 """When to stop: number of passes, time, estimated error, whichever comes first.
 
 Time is wall-clock time from the call on, without the compilation of kernels: that happens once, in
-the first pass, and depends on what is cached. A pass begins only if the mean of the last ones says
-that it will end within the limit; the first one always does.
+the first pass, and depends on what is cached. Rendering ends as near to the limit as whole passes
+allow: one more begins if, by the mean of the last ones, half of it will lie within. The first pass
+always does.
 """
 
 from __future__ import annotations
@@ -32,7 +33,6 @@ class Stopping:
         self._began = time.perf_counter()
         self._compiling = 0.0
         self._durations: list[float] = []
-        self._first = True
         # A history that the caller keeps is the caller's; then compilation counts as rendering.
         self._history = settings.time > 0 and not dr.flag(dr.JitFlag.KernelHistory)
         if self._history:
@@ -75,7 +75,7 @@ class Stopping:
         if count == 0:
             return False
         s = self.settings
-        if s.time and self.spent() + self._expected_duration() > s.time:
+        if s.time and self.spent() + 0.5 * self._expected_duration() > s.time:
             return True
         enough = count >= MIN_PASSES and error is not None and error <= s.target_error
         return bool(s.target_error) and enough
