@@ -100,15 +100,20 @@ def _spectrum(emitter, si, active):
 def prepare(scene) -> Emission:
     """Measure the power of every emitter of a scene with at least one.
 
-    Raises ValueError for an emitter whose spectrum cannot be evaluated (spectral variants).
+    Raises ValueError for an emitter that cannot start light paths.
     """
-    if mi.is_spectral:
-        for emitter in scene.emitters():
-            if emitter.class_name() == "Projector":
-                raise ValueError(
-                    f'aniso_pm: emitter "{emitter.id()}" is a projector, whose light cannot be '
-                    "evaluated at given wavelengths; use an RGB variant, or a spot with a texture"
-                )
+    for emitter in scene.emitters():
+        kind = emitter.class_name()
+        if kind == "TimedSunskyEmitter":
+            raise ValueError(
+                f'aniso_pm: emitter "{emitter.id()}" is a timed_sunsky, from which Mitsuba cannot '
+                'trace light (its sample_ray raises); use "sunsky" for one point in time'
+            )
+        if mi.is_spectral and kind == "Projector":
+            raise ValueError(
+                f'aniso_pm: emitter "{emitter.id()}" is a projector, whose light cannot be '
+                "evaluated at given wavelengths; use an RGB variant, or a spot with a texture"
+            )
     emitters = scene.emitters_dr()
     count = dr.width(emitters)
     varying = int(mi.EmitterFlags.Surface) | int(mi.EmitterFlags.SpatiallyVarying)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import aniso_pm  # noqa: F401 (registers the plugins)
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from energy import indirect
@@ -72,6 +73,45 @@ def plate(bsdf, name="plate", x=0.05, turn=0, both=True):
     to_world = T().translate([x, -0.35, -0.6]).rotate([0, 1, 0], turn).rotate([1, 0, 0], -20)
     bsdf = {"type": "twosided", "b": bsdf} if both else bsdf
     return {name: {"type": "rectangle", "to_world": to_world.scale(0.5), "bsdf": bsdf}}
+
+
+def register_user_bsdf():
+    """A BSDF as users write them: nothing but the interface tells what it is."""
+
+    class UserBSDF(mi.BSDF):
+        def __init__(self, props):
+            super().__init__(props)
+            flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+            self.m_components = [flags]
+            self.m_flags = flags
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
+            bs.pdf = mi.warp.square_to_cosine_hemisphere_pdf(bs.wo)
+            bs.eta = 1.0
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+            bs.sampled_component = mi.UInt32(0)
+            value = self.eval(ctx, si, bs.wo, active)
+            return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
+
+        def eval(self, ctx, si, wo, active=True):
+            up = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
+            # Darker the further apart: not Lambertian
+            albedo = 0.3 + 0.4 * dr.square(dr.dot(si.wi, wo))
+            return dr.select(up, mi.Spectrum(albedo * dr.inv_pi * wo.z), 0)
+
+        def pdf(self, ctx, si, wo, active=True):
+            up = active & (mi.Frame3f.cos_theta(si.wi) > 0)
+            return dr.select(up, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def traverse(self, callback):
+            pass
+
+    mi.register_bsdf("userbsdf", UserBSDF)
 
 
 def lights():
@@ -229,6 +269,7 @@ def rows():
                 brushed | {"alpha_u": image((2, 2, 1), 1, True, 0.1, 0.5), "alpha_v": 0.3}
             )
         ),
+        "BSDF written in Python": Row(objects=ball({"type": "userbsdf"})),
         # --- wrappers ---
         "twosided blend of diffuse and brushed": Row(objects=plate(blend(diffuse, brushed))),
         "blend of diffuse and mirror": Row(objects=ball(blend(diffuse, mirror))),
@@ -266,6 +307,15 @@ def rows():
                     "radius": 0.2,
                     "bsdf": {"type": "twosided", "b": diffuse},
                 },
+            }
+        ),
+        "curve": Row(
+            objects={
+                "curve": {
+                    "type": "bsplinecurve",
+                    "filename": str(REFERENCE.with_name("curve.txt")),
+                    "bsdf": {"type": "twosided", "b": diffuse},
+                }
             }
         ),
         # --- paths ---
@@ -313,6 +363,7 @@ def rows():
 
 def make(row, size=SIZE):
     """The scene of a row."""
+    register_user_bsdf()
     scene = room(size=size)
     light, open_ = lights()[row.light]
     for name in ("light", *(("ceiling",) if open_ else ()), *row.drop):

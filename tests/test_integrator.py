@@ -475,12 +475,57 @@ def test_spectral_agrees_with_path(variant_llvm_spectral, emitter):
     np.testing.assert_allclose(image, path.mean((0, 1)), rtol=0.03)
 
 
+def test_specfilm_agrees_with_path(variant_llvm_spectral):
+    """Bands of its own instead of RGB."""
+    definition = room(size=8)
+    definition["sensor"]["film"] = {
+        "type": "specfilm",
+        "width": 8,
+        "height": 8,
+        "rfilter": {"type": "box"},
+        "component_format": "float32",
+        "band1_low": {"type": "spectrum", "value": [(400, 1.0), (500, 1.0), (550, 0.0)]},
+        "band2_high": {"type": "spectrum", "value": [(500, 0.0), (600, 1.0), (700, 1.0)]},
+    }
+    scene = mi.load_dict(definition)
+    ours = integrator(photon_count=20_000, passes=32, initial_radius=0.05)
+    image = array(mi.render(scene, integrator=ours, spp=512)).mean((0, 1))
+    path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=4096))
+    assert image.shape == (2,)
+    np.testing.assert_allclose(image, path.mean((0, 1)), rtol=0.03)
+
+
 def test_spectral_refuses_what_cannot_share_wavelengths(variant_llvm_spectral):
     definition = room(size=4)
     texture = {"type": "bitmap", "data": mi.TensorXf(np.ones((2, 2, 3), np.float32))}
     definition["light"] = {"type": "projector", "irradiance": texture}
     with pytest.raises(ValueError, match="is a projector.*use an RGB variant"):
         integrator().render(mi.load_dict(definition), spp=1)
+
+
+@pytest.mark.parametrize("kind", ["thinlens", "orthographic", "batch"])
+def test_other_sensors_see_what_path_sees(rgb, kind):
+    T = mi.ScalarTransform4f
+    definition = room(size=16)
+    camera = definition["sensor"]
+    film = camera["film"]
+    if kind == "thinlens":
+        definition["sensor"] |= {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 1.5}
+    elif kind == "orthographic":
+        to_world = T().look_at([0, 0, 0.9], [0, -0.2, 0], [0, 1, 0]).scale([0.8, 0.8, 1])
+        definition["sensor"] = {"type": "orthographic", "to_world": to_world, "film": film}
+    else:
+        cameras = {}
+        for k in range(2):
+            to_world = T().look_at([0.4 * k, 0, 0.97], [0, -0.15, 0], [0, 1, 0])
+            cameras[f"camera{k}"] = {"type": "perspective", "fov": 75, "to_world": to_world}
+        definition["sensor"] = {"type": "batch", "film": film | {"width": 32}} | cameras
+    scene = mi.load_dict(definition)
+    image = array(mi.render(scene, integrator=integrator(photon_count=100_000, passes=2), spp=128))
+    path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=512))
+    assert image.shape == path.shape
+    columns = lambda a: a.reshape(16, -1, 8, 3).mean((0, 2))  # noqa: E731
+    np.testing.assert_allclose(columns(image), columns(path), rtol=0.04)
 
 
 def test_scalar_variants_are_refused_at_loading():
