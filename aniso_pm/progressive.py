@@ -168,7 +168,9 @@ class _Run:
             self.radius0 = self.radius0 or automatic_radius(self.scene, rays, self.seed)
         self.scene = self.scene.with_(photon_count=count)
         self.clock.lap("pilot")
-        self.frozen = settings.passes != 1
+        # The response curves of a specfilm do not survive a replay of the scene that they are in.
+        special = mi.has_flag(self.film.flags(), mi.FilmFlags.Special)
+        self.frozen = settings.passes != 1 and not special
         if self.frozen:
             self.scene = self.scene.frozen()
         if checkpoint:

@@ -92,8 +92,8 @@ class AnisoPhotonMapper:
 
      * - time
        - |float|
-       - Seconds after which rendering ends, as near as whole passes allow. Compilation of kernels is
-         not counted; the first pass is always finished. 0 is no limit. (Default: 0)
+       - Seconds after which rendering ends, as near as whole passes allow. Compilation of kernels
+         is not counted; the first pass is always finished. 0 is no limit. (Default: 0)
 
      * - target_error
        - |float|
