@@ -14,8 +14,9 @@ from aniso_pm._version import __version__
 
 _llvm.prepare()
 
-from aniso_pm import asg, kernel, ndf, plugins, warp  # noqa: E402  (Dr.Jit must load after LLVM)
+# Dr.Jit must load after LLVM.
+from aniso_pm import asg, kernel, ndf, plugins, progress, state, warp  # noqa: E402
 
 plugins.register()
 
-__all__ = ["__version__", "asg", "kernel", "ndf", "warp"]
+__all__ = ["__version__", "asg", "kernel", "ndf", "progress", "state", "warp"]

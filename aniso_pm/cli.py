@@ -13,7 +13,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +21,7 @@ import typer
 from aniso_pm import _llvm, output
 from aniso_pm._version import __version__
 from aniso_pm.errors import InputError, is_interrupt, one_line
+from aniso_pm.progress import bar
 
 INTERRUPTED = 130
 
@@ -98,8 +99,27 @@ def render(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Random seed.")] = 0,
     passes: Annotated[
-        int | None, typer.Option(min=1, max=2**31 - 1, help="Progressive passes.")
+        int | None, typer.Option(min=1, max=10**7, help="Stop after so many passes.")
     ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--time", min=0.001, help="Stop after so many seconds.")
+    ] = None,
+    target_error: Annotated[
+        float | None,
+        typer.Option(min=1e-6, help="Stop at this relative standard error (0.02: 2 %)."),
+    ] = None,
+    first_pass: Annotated[
+        int, typer.Option(min=0, max=10**7, help="Number of the first pass.")
+    ] = 0,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the state beside the picture.")
+    ] = False,
+    keep_state: Annotated[
+        bool, typer.Option("--keep-state", help="Keep the state of a finished picture, to merge.")
+    ] = False,
+    save_every: Annotated[
+        float, typer.Option(min=0, help="Seconds between savings of picture and state.")
+    ] = 30.0,
     sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
     png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no warnings.")] = False,
@@ -109,7 +129,14 @@ def render(
 ) -> int:
     """Render a scene with the integrator it names and write the picture as OpenEXR.
 
-    The header of the picture records parameters, seed, versions, timings and statistics.
+    The header of the picture records parameters, seed, versions, timings and statistics. With
+    several passes the layers "variance" and "standard_error" tell how noisy the picture is.
+
+    --passes, --time and --target-error take the place of all the scene's own stopping rules.
+    While passes are rendered, the picture so far and its state (OUT with the suffix .state) are
+    saved again and again; --resume goes on from there. Finished pictures lose their state unless
+    --resume or --keep-state was given. Passes 8 to 15 of a picture, to be merged with passes 0 to
+    7, are --first-pass 8 --passes 8 with the same samples per pass.
     """
     # --- Find out what would fail, before anything slow ---
     defines = _parse_defines(define or [])
@@ -127,25 +154,37 @@ def render(
         started = time.perf_counter()
         world, camera, integrator = _load(scene, defines, sensor)
         loaded = time.perf_counter()
-        if passes is not None:
-            if not hasattr(integrator, "passes"):
-                raise InputError(f"--passes: {integrator.class_name()} renders in one pass only")
-            try:
-                integrator.passes = passes
-            except ValueError as error:
-                raise InputError(one_line(error)) from error
+        rules = {"passes": passes, "time": seconds, "target_error": target_error}
+        rules = {name: value for name, value in rules.items() if value is not None}
+        kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state)
+        made_by = {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
+
+        def write() -> dict[str, Any]:
+            """Write the picture so far and what made it."""
+            record = _record(integrator, camera) | made_by
+            now = time.perf_counter()
+            record["seconds"] = {"load": loaded - started, "render": now - loaded}
+            variance = getattr(integrator, "variance", None)
+            output.write_exr(camera.film(), out, record, variance)
+            if picture:
+                output.write_png(camera.film(), picture)
+            return record
 
         # --- Render ---
-        statistics = _render(world, camera, integrator, seed, spp, quiet)
-        rendered = time.perf_counter()
+        state_file = out.with_suffix(".state")
+        if kept is not None:
+            from aniso_pm.state import Checkpoint
 
-        # --- Write the picture and what made it ---
-        record = _record(integrator, statistics, camera)
-        record |= {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
-        record["seconds"] = {"load": loaded - started, "render": rendered - loaded}
-        output.write_exr(camera.film(), out, record)
-        if picture:
-            output.write_png(camera.film(), picture)
+            output.sweep(state_file)
+            output.sweep(out)
+            integrator.checkpoint = Checkpoint(state_file, save_every, resume, write)
+            if resume and not state_file.exists() and not quiet:
+                print(f"aniso-pm: no state '{state_file}' yet, starting afresh", file=sys.stderr)
+        _render(world, camera, integrator, seed, spp, quiet)
+        record = write()
+        statistics = record["statistics"]
+        if kept is False and not statistics["interrupted"]:
+            state_file.unlink(missing_ok=True)
 
     if as_json:
         record |= {"output": str(out), "png": str(picture) if picture else None}
@@ -153,6 +192,67 @@ def render(
     if statistics.get("interrupted"):
         print("aniso-pm: interrupted, the picture so far is written", file=sys.stderr)
         return INTERRUPTED
+    return 0
+
+
+@app.command()
+def merge(
+    states: Annotated[list[Path], typer.Argument(help="States (.state), or their pictures.")],
+    out: Annotated[Path, typer.Option("--output", "-o", help="Picture to write (.exr).")],
+    png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
+    ] = False,
+) -> int:
+    """Add up passes of one picture that were rendered apart, with --keep-state.
+
+    Writes the picture and, beside it, the state of all passes, from which it can be merged again
+    or resumed. All must have the same scene, parameters, seed and samples per pass, and no pass
+    may occur twice.
+    """
+    from aniso_pm import film as films
+    from aniso_pm.state import State, StateError
+    from aniso_pm.state import merge as merged
+
+    if out.suffix.lower() != ".exr":
+        raise InputError(f"cannot write '{out}': the output's name must end in .exr")
+    picture = out.with_suffix(".png") if png else None
+    for path in filter(None, [out, picture]):
+        output.check_writable(path)
+    try:
+        loaded = {}
+        for name in states:
+            path = name.with_suffix(".state") if name.suffix.lower() == ".exr" else name
+            if str(path) in loaded:
+                raise InputError(f"{path}: named twice")
+            loaded[str(path)] = State.load(path)
+        total = merged(loaded)
+    except StateError as error:
+        raise InputError(str(error)) from error
+    except OSError as error:
+        raise InputError(f"{error.filename}: {error.strerror}") from error
+
+    _set_variant(total.identity["variant"])
+    try:
+        film = films.from_description(total.film)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    films.show_array(film, total.arrays["first"])
+    record = {
+        "merged": list(loaded),
+        "passes": total.passes,
+        "seed": total.identity["seed"],
+        "variant": total.identity["variant"],
+        "statistics": total.statistics,
+        "depends_on": total.identity,
+    }
+    output.write_exr(film, out, record, total.variance())
+    if picture:
+        output.write_png(film, picture)
+    total.save(out.with_suffix(".state"))
+    if as_json:
+        record |= {"output": str(out), "png": str(picture) if picture else None}
+        print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
     return 0
 
 
@@ -234,7 +334,9 @@ def _load(scene: Path, defines: dict[str, str], sensor: int):
     import mitsuba as mi
 
     try:
-        world = mi.load_file(str(scene), **defines)
+        # optimize merges meshes in the order of their addresses: the order of shapes and lights,
+        # and with it all random decisions, would be another one in every process.
+        world = mi.load_file(str(scene), optimize=False, **defines)
     except BaseException as error:
         if is_interrupt(error):
             raise InterruptError from error
@@ -255,10 +357,36 @@ def _load(scene: Path, defines: dict[str, str], sensor: int):
     return world, sensors[sensor], integrator
 
 
-def _render(world, camera, integrator, seed: int, spp: int | None, quiet: bool) -> dict[str, Any]:
-    """Leave the picture in the camera's film; returns the integrator's statistics, or {}."""
+def _prepare_passes(
+    integrator, rules: dict[str, Any], first_pass: int, keep_state: bool
+) -> bool | None:
+    """Set the options that concern passes; an InputError where the integrator has none.
+
+    Returns whether the state shall stay when all is done, and None where there is none to keep:
+    a single pass has no state unless it is asked for.
+    """
+    if not hasattr(integrator, "stop_after"):
+        options = [f"--{name.replace('_', '-')}" for name in rules]
+        options += ["--first-pass"] if first_pass else []
+        options += ["--resume or --keep-state"] if keep_state else []
+        if options:
+            kind = integrator.class_name()
+            raise InputError(f"{', '.join(options)}: {kind} renders in one pass only")
+        return None
+    if rules:
+        try:
+            integrator.stop_after(**rules)
+        except ValueError as error:
+            raise InputError(one_line(error)) from error
+    integrator.first_pass = first_pass
+    return keep_state if keep_state or integrator.settings.passes != 1 else None
+
+
+def _render(world, camera, integrator, seed: int, spp: int | None, quiet: bool) -> None:
+    """Leave the picture in the camera's film."""
+    visible = not quiet and sys.stderr.isatty() and hasattr(integrator, "progress")
     try:
-        with _progress_bar(integrator, quiet):
+        with bar(integrator, file=sys.stderr, leave=False) if visible else nullcontext():
             # Not mi.render(): it hides errors inside a differentiable operation.
             integrator.render(world, sensor=camera, seed=seed, spp=spp or 0)
     except ValueError as error:
@@ -268,12 +396,12 @@ def _render(world, camera, integrator, seed: int, spp: int | None, quiet: bool) 
         if is_interrupt(error):
             raise InterruptError from error
         raise
-    return dict(getattr(integrator, "statistics", None) or {})
 
 
-def _record(integrator, statistics: dict[str, Any], camera) -> dict[str, Any]:
+def _record(integrator, camera) -> dict[str, Any]:
     from aniso_pm.doctor import versions
 
+    statistics = dict(getattr(integrator, "statistics", None) or {})
     kind = type(integrator)
     in_python = not kind.__module__.startswith("mitsuba")
     return {
@@ -285,27 +413,6 @@ def _record(integrator, statistics: dict[str, Any], camera) -> dict[str, Any]:
         "statistics": statistics,
         "versions": versions(),
     }
-
-
-@contextmanager
-def _progress_bar(integrator, quiet: bool) -> Iterator[None]:
-    if quiet or not sys.stderr.isatty() or not hasattr(integrator, "progress"):
-        yield
-        return
-
-    from tqdm import tqdm
-
-    with tqdm(file=sys.stderr, leave=False, dynamic_ncols=True) as bar:
-
-        def show(done: float, total: int, text: str) -> None:
-            bar.total, bar.n = total, round(done, 2)
-            bar.set_postfix_str(text)
-
-        integrator.progress = show
-        try:
-            yield
-        finally:
-            integrator.progress = None
 
 
 @contextmanager

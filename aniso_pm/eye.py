@@ -99,7 +99,7 @@ def take(points, index):
     return map_tree(lambda v: dr.gather(type(v), v, index), points)
 
 
-def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0):
+def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=None):
     """Trace camera paths: (radiance, valid, GatherPoints or None).
 
     radiance  W/m²/sr: emission, direct light, and whatever the map does not stand for. NaN where
@@ -107,32 +107,41 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0):
     valid     did the ray meet anything but null surfaces and, if they are hidden, emitters?
               (alpha, as in ``path``)
     expected  gather points to make room for; with too few the same paths are traced again.
+    launch    ``eye_paths``, or that function frozen.
     """
     # Without mixed receivers a path ends where it leaves its first gather point.
     single = options.use == "global" and not options.general
     capacity = dr.width(ray) if single else max(2 * dr.width(ray), expected + expected // 8)
     while True:
-        rows = dr.zeros(mi.UInt32, 1)
+        rows, room = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, capacity)
         points = map_tree(lambda v: dr.empty(type(v), capacity), _blank(options))  # noqa: B023
-        room = dr.opaque(mi.UInt32, capacity)
-
-        def push(point, active):
-            slot = dr.scatter_inc(rows, mi.UInt32(0), active)  # noqa: B023
-            active = active & (slot < room)  # noqa: B023
-
-            def put(column, value):
-                dr.scatter(column, value, slot, active)
-                return column
-
-            map_tree(put, points, point)  # noqa: B023
-
-        L, valid = _walk(scene, sampler.clone(), ray, options, push)
+        L, valid, rows, points = (launch or eye_paths)(
+            scene, sampler.clone(), ray, options, rows, points, room
+        )
         dr.eval(L, valid, rows, points)
         found = int(rows[0])
         if found <= capacity:
             break
         capacity = found + found // 16
     return L, valid, take(points, dr.arange(mi.UInt32, found)) if found else None
+
+
+def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room):
+    """One wavefront of eye paths, gather points into their columns: (radiance, valid, rows used,
+    columns)."""
+
+    def push(point, active):
+        slot = dr.scatter_inc(rows, mi.UInt32(0), active)
+        active = active & (slot < room)
+
+        def put(column, value):
+            dr.scatter(column, value, slot, active)
+            return column
+
+        map_tree(put, points, point)
+
+    L, valid = _walk(scene, sampler, ray, options, push)
+    return L, valid, rows, points
 
 
 def _first_lobe(o: WalkOptions) -> LobeOnPath | None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -45,7 +48,9 @@ def wavelengths(sensor, u):
 
 
 def splat(film, position, radiance, valid, spp, wavelengths):
-    """Add one wavefront of samples to the film. valid: alpha is 1 there, else 0."""
+    """One wavefront of samples as the film's own storage has it: TensorXf (height, width,
+    channels), weighted by the reconstruction filter, the weight in the last channel. valid: alpha
+    is 1 there, else 0."""
     block = film.create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
     alpha = dr.select(valid, mi.Float(1), mi.Float(0))
@@ -64,9 +69,64 @@ def splat(film, position, radiance, valid, spp, wavelengths):
             channels.append(alpha)
         channels.append(mi.Float(1))
     block.put(position, channels)
-    film.put_block(block)
+    image = block.tensor()
+    dr.eval(image)
+    return image
+
+
+def show(film, image):
+    """Let the film hold ``image`` (as of :func:`splat`) and nothing else."""
+    film.clear()
+    film.put_block(mi.ImageBlock(image, mi.ScalarPoint2i(film.crop_offset())))
     film.schedule_storage()
     dr.eval()
+
+
+def show_array(film, array):
+    """As :func:`show`, from a NumPy array."""
+    show(film, mi.TensorXf(array.astype("float32")))
+
+
+def describe(film) -> dict[str, Any]:
+    """What :func:`from_description` needs to make a film that develops sums as this one would."""
+    # Only its text tells the formats, and in short.
+    formats = dict(re.findall(r"(pixel_format|component_format) = (\w+)", str(film)))
+    long = {"y": "luminance", "ya": "luminance_alpha"}
+    formats = {name: long.get(value, value) for name, value in formats.items()}
+    return {
+        "kind": film.class_name(),
+        "size": [int(n) for n in film.size()],
+        "crop_size": [int(n) for n in film.crop_size()],
+        "crop_offset": [int(n) for n in film.crop_offset()],
+        "formats": formats,
+    }
+
+
+def from_description(description: dict[str, Any]):
+    """A film without a scene, for the sums of one that was described by :func:`describe`. Raises
+    ValueError for other kinds than hdrfilm."""
+    if description["kind"] != "HDRFilm":
+        raise ValueError(
+            f"aniso_pm: the passes were rendered for a {description['kind']}; only those for an "
+            "hdrfilm can be developed without their scene"
+        )
+    (width, height), crop = description["size"], description["crop_size"]
+    offset = description["crop_offset"]
+    film = mi.load_dict(
+        {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "crop_width": crop[0],
+            "crop_height": crop[1],
+            "crop_offset_x": offset[0],
+            "crop_offset_y": offset[1],
+            "rfilter": {"type": "box"},
+            **description["formats"],
+        }
+    )
+    film.prepare([])
+    return film
 
 
 def _border(film) -> int:

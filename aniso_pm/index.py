@@ -102,6 +102,8 @@ def _iota(n):
 
 def _leaf_boxes(points, count, n_leaves):
     low, high = dr.full(mi.Point3f, dr.inf, n_leaves), dr.full(mi.Point3f, -dr.inf, n_leaves)
+    # As a literal, the count would be compiled into the kernel: a new one for every map.
+    count = dr.opaque(mi.UInt32, count)
     first = LEAF * _iota(n_leaves)
     for k in range(LEAF):
         exists = first + k < count

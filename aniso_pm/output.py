@@ -20,16 +20,31 @@ class OutputError(Exception):
 
 
 @contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path`` that takes its place if the block succeeds."""
-    partial = path.with_name(f".{path.stem}.partial.{os.getpid()}{path.suffix}")
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside ``path`` that takes its place if the block succeeds, once its
+    content is on the disk."""
+    partial = _partial(path, os.getpid())
     try:
         yield partial
+        with open(partial, "rb+") as file:
+            os.fsync(file.fileno())
         os.replace(partial, path)
     except OSError as error:
         raise OutputError(f"cannot write '{path}': {error.strerror or error}") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _partial(path: Path, process: int | str) -> Path:
+    return path.with_name(f".{path.stem}.partial.{process}{path.suffix}")
+
+
+def sweep(path: Path) -> None:
+    """Remove what killed processes have left half-written for ``path``."""
+    for partial in path.parent.glob(_partial(path, "*").name):
+        process = partial.name.removesuffix(path.suffix).rpartition(".")[2]
+        if process.isdigit() and not Path("/proc", process).exists() and Path("/proc").is_dir():
+            partial.unlink(missing_ok=True)
 
 
 def check_writable(path: Path) -> None:
@@ -38,7 +53,7 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"cannot write '{path}': it is a directory")
     if not path.parent.is_dir():
         raise OutputError(f"cannot write '{path}': there is no directory '{path.parent}'")
-    partial = path.with_name(f".{path.stem}.partial.{os.getpid()}{path.suffix}")
+    partial = _partial(path, os.getpid())
     try:
         partial.touch()
         partial.unlink()
@@ -64,18 +79,24 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def write_exr(film, path: Path, record: Mapping[str, Any]) -> None:
+def write_exr(film, path: Path, record: Mapping[str, Any], variance=None) -> None:
     """Write ``film`` with all its channels as OpenEXR.
 
     ``record`` (nested mappings) goes into the header twice: whole, as JSON, in the attribute
     ``aniso_pm``; and flat, one attribute ``aniso_pm.outer.inner`` for each number or text.
+
+    ``variance`` (height × width × channels R, G, B, perhaps A), that of the picture, adds the
+    layers ``variance`` and ``standard_error``, its root. All channels are float32 then: half
+    precision has no room for a variance of 1e-8.
     """
     import mitsuba as mi
 
     bitmap = film.bitmap()
+    if variance is not None:
+        bitmap = _with_layers(bitmap, {"variance": variance, "standard_error": variance**0.5})
     # Only its text tells in which format the film wants to be stored. Pictures with AOVs stay
     # float32: Mitsuba's conversion renames such channels and then fails to find them.
-    if "component_format = float16" in str(film):
+    elif "component_format = float16" in str(film):
         if bitmap.pixel_format() != mi.Bitmap.PixelFormat.MultiChannel:
             bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16, srgb_gamma=False)
 
@@ -84,11 +105,29 @@ def write_exr(film, path: Path, record: Mapping[str, Any]) -> None:
     metadata["aniso_pm"] = json.dumps(record, ensure_ascii=False, allow_nan=False)
     for key, value in _flatten("aniso_pm", record):
         metadata[key] = value
-    with _replacing(path) as partial:
+    with replacing(path) as partial:
         try:
             bitmap.write(str(partial))
         except RuntimeError as error:
             raise OutputError(f"cannot write '{path}': {error}") from error
+
+
+def _with_layers(bitmap, layers: Mapping[str, Any]):
+    """``bitmap`` with more channels, named ``layer.R`` and so on."""
+    import mitsuba as mi
+    import numpy as np
+
+    pixels = np.array(bitmap, dtype=np.float32)
+    parts = [pixels.reshape(*pixels.shape[:2], -1)]
+    names = [part.name for part in bitmap.struct_()]
+    for layer, values in layers.items():
+        parts.append(np.asarray(values, dtype=np.float32))
+        count = values.shape[2]
+        # Sums are R, G, B, whatever the film makes of them, unless it is a spectral one.
+        own = [name for name in names if "." not in name][:count]
+        names += [f"{layer}.{channel}" for channel in ("RGBA"[:count] if count <= 4 else own)]
+    pixels = np.concatenate(parts, axis=2)
+    return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names)
 
 
 def _flatten(prefix: str, value: Any) -> Iterator[tuple[str, str | int | float]]:
@@ -120,5 +159,5 @@ def write_png(film, path: Path) -> None:
         component_format=mi.Struct.Type.UInt8,
         srgb_gamma=True,
     )
-    with _replacing(path) as partial:
+    with replacing(path) as partial:
         picture.write(str(partial))

@@ -93,13 +93,16 @@ def build_map(
     seed: int,
     options: TraceOptions,
     expected: int = 0,
+    launch=None,
 ):
     """Trace ``photon_count`` light paths from ``source`` and index what they leave.
 
-    expected  photons that an earlier map of the same scene stored (sizes the buffers).
+    expected  photons to make room for; with too little room the same paths are traced again.
+    launch    ``light_paths``, or that function frozen.
     """
+    room = max(expected, int(_FIRST_GUESS * photon_count))
     stored, rejected, photons = _trace(
-        scene, source, photon_count, seed, options, expected or int(_FIRST_GUESS * photon_count)
+        scene, source, photon_count, seed, options, room, launch or light_paths
     )
     if stored == 0:
         return PhotonMap(photon_count, 0, rejected, None, None, None, None)
@@ -189,7 +192,7 @@ class _Photons:
     direction: Any
 
 
-def _trace(scene, source, photon_count, seed, options, capacity):
+def _trace(scene, source, photon_count, seed, options, capacity, launch):
     """(stored, rejected, _Photons with buffers of at least ``stored`` entries)."""
     while True:
         capacity = max(capacity + capacity // 16, 1024)
@@ -199,33 +202,40 @@ def _trace(scene, source, photon_count, seed, options, capacity):
             dr.empty(mi.Float, capacity * _flux_width()),
             dr.empty(mi.UInt32, capacity) if options.general else None,
         )
-        stored, rejected = dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, 1)
+        stored, rejected = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0)
         room = dr.opaque(mi.UInt32, capacity)
-
-        def reject(active):
-            dr.scatter_add(rejected, mi.UInt32(1), mi.UInt32(0), active)  # noqa: B023
-
-        def store(position, word, flux, direction, active):
-            slot = dr.scatter_inc(stored, mi.UInt32(0), active)  # noqa: B023
-            active = active & (slot < room)  # noqa: B023
-            dr.scatter(photons.position, position, slot, active)  # noqa: B023
-            dr.scatter(photons.word, word, slot, active)  # noqa: B023
-            dr.scatter(photons.flux, _pack(flux), slot, active)  # noqa: B023
-            if options.general:
-                dr.scatter(photons.direction, _encode(direction, 16), slot, active)  # noqa: B023
-
         for first in range(0, photon_count, WAVEFRONT):
             sampler = mi.load_dict({"type": "independent"})
             sampler.seed(
                 mi.sample_tea_32(seed, first // WAVEFRONT)[0], min(WAVEFRONT, photon_count - first)
             )
-            _trace_wavefront(scene, source, sampler, options, store, reject)
-            dr.eval(photons.position, photons.word, photons.flux, photons.direction)
-            dr.eval(stored, rejected)
+            photons, stored, rejected = launch(
+                scene, source, sampler, options, photons, stored, rejected, room
+            )
+            dr.eval(photons, stored, rejected)
         count = int(stored[0])
         if count <= capacity:
             return count, int(rejected[0]), photons
         capacity = count
+
+
+def light_paths(scene, source, sampler, options, photons, stored, rejected, room):
+    """One wavefront of light paths into the buffers; returns what it has changed."""
+
+    def reject(active):
+        dr.scatter_add(rejected, mi.UInt32(1), mi.UInt32(0), active)
+
+    def store(position, word, flux, direction, active):
+        slot = dr.scatter_inc(stored, mi.UInt32(0), active)
+        active = active & (slot < room)
+        dr.scatter(photons.position, position, slot, active)
+        dr.scatter(photons.word, word, slot, active)
+        dr.scatter(photons.flux, _pack(flux), slot, active)
+        if options.general:
+            dr.scatter(photons.direction, _encode(direction, 16), slot, active)
+
+    _trace_wavefront(scene, source, sampler, options, store, reject)
+    return photons, stored, rejected
 
 
 @dr.syntax

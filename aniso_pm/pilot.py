@@ -19,6 +19,8 @@ from .prepared import PILOT, Prepared, stream_seed
 
 # Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
 PHOTONS_PER_KERNEL = 60
+# Range of the automatic number of light paths: the most take half a gigabyte.
+FEWEST, MOST = 10_000, 5_000_000
 # Light paths and eye paths of the pilot, and photons that a disc must hold to be measured.
 _PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
 # Range of radii as shares of the scene's extent: 1e-5 · √2^27 = 0.1.
@@ -79,3 +81,25 @@ def automatic_radius(scene: Prepared, rays, seed: int) -> float:
     median = _weighted_median(radius.numpy())
     more_photons = scene.settings.photon_count / pilot.settings.photon_count
     return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), _LARGEST * extent)
+
+
+def automatic_photon_count(scene: Prepared, rays, seed: int, eye_samples: int) -> int:
+    """Light paths per pass that are about as much work as its eye samples, two digits.
+
+    Work is counted, not timed, so that every machine chooses the same: one unit for an eye sample
+    and for each of its gather points, one for a light path and for each photon that it leaves. Both
+    means are the pilot's.
+
+    rays: camera rays. eye_samples: of a pass. Returns FEWEST where there is nothing to gather.
+    """
+    pilot = scene.with_(photon_count=_PATHS)
+    map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(stream_seed(seed, PILOT, 1), dr.width(rays))
+    _, _, points = scene.trace(sampler, rays)
+    if points is None or map_.stored == 0:
+        return FEWEST
+    gathers = dr.width(points.lane) / dr.width(rays)
+    balanced = eye_samples * (1 + gathers) / (1 + map_.stored / map_.emitted)
+    digits = 1 - int(math.log10(balanced))
+    return int(min(max(round(balanced, digits), FEWEST), MOST))

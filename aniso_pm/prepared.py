@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,6 +37,14 @@ class Radiance:
 
 
 @dataclass(frozen=True)
+class Launch:
+    """The two functions that take most time to trace; frozen, they are traced once and replayed."""
+
+    light: Callable = photons.light_paths
+    eye: Callable = eye.eye_paths
+
+
+@dataclass(frozen=True)
 class Prepared:
     """A scene, its needs, the parameters, and the decisions that follow from them."""
 
@@ -43,10 +53,24 @@ class Prepared:
     settings: Settings
     hide_emitters: bool
     emission: emission.Emission | None
+    launch: Launch = Launch()
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
         return replace(self, settings=self.settings.with_(**changes))
+
+    def thawed(self) -> Prepared:
+        """The same scene with nothing frozen."""
+        return replace(self, launch=Launch())
+
+    def frozen(self) -> Prepared:
+        """The same scene for many passes: paths are traced in Python once and then replayed."""
+        # Scenes that nobody uses any more must not vanish while Dr.Jit records this one: their
+        # materials are part of the same virtual function calls.
+        gc.collect()
+        return replace(
+            self, launch=Launch(dr.freeze(photons.light_paths), dr.freeze(eye.eye_paths))
+        )
 
     @property
     def extent(self) -> float:
@@ -115,7 +139,9 @@ class Prepared:
             wavelengths,
         )
         seed = stream_seed(seed, PHOTONS, index)
-        return photons.build_map(self.scene, self.emission, s.photon_count, seed, options, expected)
+        return photons.build_map(
+            self.scene, self.emission, s.photon_count, seed, options, expected, self.launch.light
+        )
 
     def trace(self, sampler, ray, expected: int = 0):
         """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``."""
@@ -131,7 +157,7 @@ class Prepared:
             bool(self.needs.general),
             s.gather_roughness,
         )
-        return eye.trace(self.scene, sampler, ray, options, expected)
+        return eye.trace(self.scene, sampler, ray, options, expected, self.launch.eye)
 
     def gather(
         self, map_, radius, seed: int, points: eye.GatherPoints, wavelengths=None

@@ -1,166 +1,397 @@
-"""Passes: fresh photons and fresh eye paths, accumulated in the film at a shrinking bandwidth.
+"""Passes: fresh photons and fresh eye paths at a shrinking bandwidth, until a rule says stop.
 
 Probabilistic progressive photon mapping [Knaus and Zwicker 2011]: pass i + 1 uses a kernel whose
 area is (i + α)/(i + 1) times that of pass i. Variance grows and bias shrinks so that the mean over
 passes converges to the right image. Passes are pure: pass i depends on (scene, parameters, seed, i)
-alone.
+alone, so that they can be rendered in several runs, or on several machines, and added up.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from . import digest, state
 from . import film as films
+from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .errors import is_interrupt
-from .pilot import automatic_radius, camera_rays
-from .prepared import COLOUR, EYE, PROBE, Prepared, stream_seed
+from .pilot import automatic_photon_count, automatic_radius, camera_rays
+from .prepared import EYE, PROBE, Prepared, stream_seed
+from .schedule import bandwidth, shares, wavelength_sample
+from .stopping import Stopping
 
 # Eye samples traced at once: bounds memory (about 250 bytes a sample).
 WAVEFRONT = 1 << 21
-
 # Passes that make the colours of a spectral picture right within about a percent.
 _SPECTRAL_PASSES = 16
+# What a pass counts.
+_COUNTS = (
+    "photons_emitted",
+    "photons_stored",
+    "photons_rejected",
+    "photons_gathered",
+    "eye_samples",
+    "eye_samples_rejected",
+    "gather_points",
+    "gather_points_anisotropic",
+    "gather_points_bounded",
+    "gather_points_off_surface",
+    "spp",
+)
 
 
-def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
-    """Kernel radius of pass ``index`` (0-based): r² shrinks by (i + α)/(i + 1) after pass i.
+@dataclass
+class Controls:
+    """What a caller may want besides the picture.
 
-    ∏ (i + α)/(i + 1) for i = 1 … index is Γ(index + 1 + α) / (Γ(1 + α) Γ(index + 2)).
+    first_pass  number of the first pass.
+    progress    called as progress(done, total, text) after every wavefront: passes, which may be
+                fractions; total is None where nobody knows.
+    callback    called as callback(pass_index, image, statistics) after every pass: the picture so
+                far as a tensor, and the statistics so far.
+    checkpoint  where to keep the state.
     """
-    log_area = math.lgamma(index + 1 + alpha) - math.lgamma(1 + alpha) - math.lgamma(index + 2)
-    return initial_radius * math.exp(0.5 * log_area)
+
+    first_pass: int = 0
+    progress: Callable[[float, int | None, str], None] | None = None
+    callback: Callable[[int, Any, dict], None] | None = None
+    checkpoint: state.Checkpoint | None = None
 
 
-def render(scene: Prepared, sensor, seed: int, spp: int, report, statistics: dict):
-    """Render all passes into the sensor's film; returns (map, radius) of the last one.
+@dataclass
+class Rendered:
+    """What is left of a rendering beside the film: map and radius of the last pass (None if no
+    pass was rendered), variance of the picture (None with one pass)."""
 
-    spp         total over all passes, shared evenly; 0 takes the sampler's own.
-    report      called as report(done, total, text) after every wavefront; done and total count
-                passes and may be fractions.
+    map: Any
+    radius: float | None
+    variance: np.ndarray | None
+
+
+def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, statistics: dict):
+    """Render passes until a stopping rule says so; leaves the picture in the sensor's film.
+
+    spp         see ``shares``; 0 takes the sampler's own.
     statistics  filled in as rendering goes on.
 
-    Ctrl-C ends rendering: the film then holds all wavefronts that were finished and
-    statistics["interrupted"] is True. It is raised on where the film is still empty.
+    Ctrl-C ends rendering: the film then holds all passes that were finished, or the wavefronts of
+    the first one, and statistics["interrupted"] is True. It is raised on where there is nothing.
+    Raises state.StateError where the checkpoint's state is not one of this rendering.
     """
-    settings = scene.settings
-    clock = _Clock()
-    film = sensor.film()
-    spp = spp or sensor.sampler().sample_count()
-    if spp < settings.passes:
-        raise ValueError(
-            f"aniso_pm: {spp} samples per pixel cannot be shared by {settings.passes} passes; "
-            f'raise the sample count to {settings.passes} or lower the parameter "passes"'
-        )
-    if not scene.scene.emitters():
-        mi.Log(mi.LogLevel.Warn, "aniso_pm: the scene has no emitters; the picture will be black")
-    if mi.is_spectral and settings.passes < _SPECTRAL_PASSES:
-        mi.Log(
-            mi.LogLevel.Warn,
-            f"aniso_pm: all light of a pass shares four wavelengths; {settings.passes} passes will "
-            f'give wrong colours, set the parameter "passes" to {_SPECTRAL_PASSES} or more',
-        )
-    film.prepare([])
-    radius0 = settings.initial_radius or automatic_radius(scene, camera_rays(sensor, seed), seed)
-    clock.lap("pilot")
-    statistics |= {
-        "initial_radius": radius0,
-        "radius_automatic": settings.initial_radius == 0,
-        "photons_emitted": 0,
-        "photons_stored": 0,
-        "photons_rejected": 0,
-        "photons_gathered": 0,
-        "eye_samples": 0,
-        "eye_samples_rejected": 0,
-        "gather_points": 0,
-        "gather_points_anisotropic": 0,
-        "gather_points_bounded": 0,
-        "gather_points_off_surface": 0,
-        "passes": 0,
-        "spp": 0,
-        "interrupted": False,
-        "seconds": clock.seconds,
-    }
-    map_ = radius = None
+    run = _Run(scene, sensor, seed, spp, controls, statistics)
+    run.start()
     try:
-        for i in range(settings.passes):
-            radius = bandwidth(radius0, settings.alpha, i)
-            colour = _wavelength_sample(seed, i)
-            wavelengths = films.wavelengths(sensor, colour) if mi.is_spectral else None
-            map_ = scene.photon_map(seed, i, map_.stored if map_ else 0, wavelengths)
-            statistics["photons_emitted"] += map_.emitted
-            statistics["photons_stored"] += map_.stored
-            statistics["photons_rejected"] += map_.rejected
-            clock.lap("photons")
-            share = spp // settings.passes + (i < spp % settings.passes)
-            for done in _eye_pass(
-                scene, sensor, map_, radius, seed, i, share, colour, statistics, clock
-            ):
-                report(i + done / share, settings.passes, f"pass {i + 1}/{settings.passes}")
-            statistics["radius"] = radius
-            statistics["passes"] += 1
+        for index in run.numbers():
+            run.render_pass(index)
     except BaseException as error:
-        if not is_interrupt(error) or statistics["spp"] == 0:
+        if not is_interrupt(error) or not run.keep_unfinished():
             raise
         statistics["interrupted"] = True
+    finally:
+        run.stopping.close()
+    run.finish()
     _warn(statistics)
-    return map_, radius
+    return Rendered(run.map, run.radius, run.variance)
 
 
-def _wavelength_sample(seed: int, index: int) -> float:
-    """Which wavelengths pass ``index`` takes: a van der Corput sequence from a random start. Each
-    sample stands for four wavelengths a quarter apart, so it needs to cover a quarter only."""
-    start = stream_seed(seed, COLOUR) / 2**32
-    sequence = int(f"{index:032b}"[::-1], 2) / 2**32
-    return (start + sequence / 4) % 1
+class _Done(NamedTuple):
+    """Whole passes. Replaced by one assignment, so that Ctrl-C finds it consistent."""
+
+    sums: Sums | None
+    passes: list[list[int]]
+    counts: dict[str, int]
 
 
-def _eye_pass(scene: Prepared, sensor, map_, radius, seed, index, spp, colour, statistics, clock):
-    """Trace ``spp`` eye samples a pixel against one map, wavefront by wavefront; yields the
-    samples a pixel taken so far."""
-    film = sensor.film()
-    pixels = films.pixel_count(film)
-    per_wavefront = max(1, min(spp, WAVEFRONT // pixels))
-    # An array, not a number: as a literal it would make every pass compile kernels of its own.
-    radius = dr.opaque(mi.Float, radius)
-    taken = wavefront = expected = 0
-    while taken < spp:
-        sampler = sensor.sampler().clone()
-        sampler.set_sample_count(min(per_wavefront, spp - taken))
-        count = sampler.sample_count()  # samplers may round it up
-        sampler.set_samples_per_wavefront(count)
-        seed_ = mi.sample_tea_32(stream_seed(seed, EYE, index), wavefront)[0]
-        sampler.seed(seed_, pixels * count)
+class _Room:
+    """How many entries a buffer needs. It grows in steps: buffers of another size are traced anew
+    by what is frozen."""
 
-        # --- Eye paths and density estimation ---
-        ray, ray_weight, position = films.sample_rays(sensor, sampler, count, colour)
-        dr.eval(ray, ray_weight, position)
-        probe_seed = mi.sample_tea_32(stream_seed(seed, PROBE, index), wavefront)[0]
-        seen = scene.radiance(sampler, ray, map_, radius, probe_seed, expected, clock.lap)
-        L = seen.L
-        for found in seen.gathered:
-            statistics["gather_points"] += dr.width(found.lane)
-            statistics["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
-            statistics["gather_points_bounded"] += int(dr.count(found.bounded)[0])
-            statistics["gather_points_off_surface"] += int(dr.count(found.lost)[0])
-            statistics["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
-        expected = sum(dr.width(found.lane) for found in seen.gathered)
+    def __init__(self):
+        self.room = 0
 
-        # --- Into the film ---
-        finite = dr.all(dr.isfinite(L))
-        statistics["eye_samples_rejected"] += dr.width(L) - int(dr.count(finite)[0])
-        films.splat(
-            film, position, dr.select(finite, L, 0) * ray_weight, seen.valid, count, ray.wavelengths
+    def seen(self, count: int):
+        if count > self.room:
+            self.room = count + count // 8
+
+
+class _Run:
+    """One call of ``render``: what changes from pass to pass."""
+
+    def __init__(self, scene, sensor, seed, spp, controls, statistics):
+        self.scene, self.sensor, self.seed = scene, sensor, seed
+        self.controls, self.statistics = controls, statistics
+        self.film = sensor.film()
+        spp = spp or sensor.sampler().sample_count()
+        pixels = films.pixel_count(self.film)
+        self.shares = shares(scene.settings, spp, pixels, controls.first_pass)
+        self.stopping = Stopping(scene.settings)
+        self.clock = _Clock()
+        self.map = self.radius = self.variance = None
+        self.done = _Done(None, [], dict.fromkeys((*_COUNTS, "passes"), 0))
+        self.photons, self.points = _Room(), _Room()
+        self.unfinished = None  # (image, counts) of the pass that is being rendered
+
+    # --- Before the first pass ---
+
+    def start(self):
+        """Pilot, or the state of an earlier run."""
+        if not self.scene.scene.emitters():
+            mi.Log(
+                mi.LogLevel.Warn, "aniso_pm: the scene has no emitters; the picture will be black"
+            )
+        passes = self.scene.settings.passes
+        if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"aniso_pm: all light of a pass shares four wavelengths; {passes} passes will give "
+                f'wrong colours, set the parameter "passes" to {_SPECTRAL_PASSES} or more',
+            )
+        self.film.prepare([])
+        settings, checkpoint = self.scene.settings, self.controls.checkpoint
+        earlier = checkpoint.start() if checkpoint else None
+        known = earlier.identity if earlier else {}
+        count = settings.photon_count or known.get("photon count")
+        self.radius0 = settings.initial_radius or known.get("initial radius")
+        if not count or not self.radius0:
+            rays = camera_rays(self.sensor, self.seed)
+            samples = self.shares.each * films.pixel_count(self.film)
+            count = count or automatic_photon_count(self.scene, rays, self.seed, samples)
+            self.scene = self.scene.with_(photon_count=count)
+            self.radius0 = self.radius0 or automatic_radius(self.scene, rays, self.seed)
+        self.scene = self.scene.with_(photon_count=count)
+        self.clock.lap("pilot")
+        # The response curves of a specfilm do not survive a replay of the scene that they are in.
+        special = mi.has_flag(self.film.flags(), mi.FilmFlags.Special)
+        self.frozen = settings.passes != 1 and not special
+        if self.frozen:
+            self.scene = self.scene.frozen()
+        if checkpoint:
+            self.identity = digest.identity(self.scene, self.sensor, self.seed, self.shares.text)
+            self.identity |= {
+                "initial radius": self.radius0,
+                "photon count": count,
+            }
+        self.statistics |= {
+            "initial_radius": self.radius0,
+            "radius_automatic": settings.initial_radius == 0,
+            "photon_count": count,
+            "photon_count_automatic": settings.photon_count == 0,
+            **self.done.counts,
+            "replayed": self.frozen,
+            "relative_error": None,
+            "interrupted": False,
+            "seconds": self.clock.seconds,
+        }
+        if earlier:
+            self._go_on_from(earlier)
+
+    def _go_on_from(self, earlier: state.State):
+        path = self.controls.checkpoint.path
+        earlier.check_same(self.identity, path)
+        first, count = self.controls.first_pass, self.scene.settings.passes
+        end = first + count if count else math.inf
+        if any(a < first or b > end for a, b in earlier.passes):
+            wanted = f"{first}-{end - 1}" if count else f"{first} and later"
+            raise state.StateError(
+                f"{path}: holds passes {state.describe(earlier.passes)}, "
+                f"but passes {wanted} are asked for"
+            )
+        counts = {name: earlier.statistics[name] for name in self.done.counts}
+        self.done = _Done(Sums.from_arrays(earlier.arrays), earlier.passes, counts)
+        self.stopping.spent_before = earlier.seconds
+        self.statistics |= counts
+        self.clock.go_on_from(earlier.statistics["seconds"])
+
+    # --- Passes ---
+
+    def numbers(self):
+        """Pass numbers to render, until a rule says stop."""
+        first, count = self.controls.first_pass, self.scene.settings.passes
+        done = set(state.numbers(self.done.passes))
+        self._check_error()
+        for index in range(first, first + count) if count else itertools.count(first):
+            if index in done:
+                continue
+            if self.stopping.reached(len(done), self.statistics["relative_error"]):
+                return
+            yield index
+            done.add(index)
+
+    def render_pass(self, index: int):
+        """One pass, from photons to sums, and what is due after it."""
+        with self.stopping.measured():
+            try:
+                image, counts = self._trace_pass(index)
+            except RuntimeError as error:
+                # Dr.Jit cannot record every scene (materials written in Python, for example).
+                if is_interrupt(error) or not self.frozen:
+                    raise
+                self.frozen, self.scene = False, self.scene.thawed()
+                self.statistics["replayed"] = False
+                image, counts = self._trace_pass(index)
+
+            # --- One more pass is done ---
+            sums = self.done.sums
+            if sums is None:
+                # Variances are worth their memory where there can be any, now or after a merge.
+                variance = self.scene.settings.passes != 1 or self.controls.checkpoint is not None
+                sums = Sums.zeros(image.shape, variance)
+            total = {name: n + counts.get(name, 1) for name, n in self.done.counts.items()}
+            passes = state.extended(self.done.passes, index)
+            self.done = _Done(sums.plus(image), passes, total)
+            self.unfinished = None
+            self.statistics |= {**total, "radius": self.radius}
+            self._check_error()
+            self.clock.lap("film")
+            self._report(index, 1)
+            self._after_pass(index)
+
+    def _trace_pass(self, index: int):
+        """(image as film blocks hold it, counts) of one pass."""
+        # --- Photons ---
+        self.unfinished = None
+        self.radius = bandwidth(self.radius0, self.scene.settings.alpha, index)
+        colour = wavelength_sample(self.seed, index)
+        wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
+        self.map = self.scene.photon_map(self.seed, index, self.photons.room, wavelengths)
+        self.photons.seen(self.map.stored)
+        counts = dict.fromkeys(_COUNTS, 0)
+        counts["photons_emitted"] = self.map.emitted
+        counts["photons_stored"] = self.map.stored
+        counts["photons_rejected"] = self.map.rejected
+        self.clock.lap("photons")
+
+        # --- Eye paths ---
+        share = self.shares(index)
+        for image, taken in self._eye_pass(index, share, colour, counts):
+            self.unfinished = image, dict(counts)
+            if taken < share:
+                self._report(index, taken / share)
+        return image, counts
+
+    def _eye_pass(self, index, spp, colour, counts):
+        """Trace ``spp`` eye samples a pixel against the map, wavefront by wavefront; yields (image
+        so far as film blocks hold it, samples a pixel so far)."""
+        scene, sensor, map_ = self.scene, self.sensor, self.map
+        film = sensor.film()
+        pixels = films.pixel_count(film)
+        per_wavefront = max(1, min(spp, WAVEFRONT // pixels))
+        # An array, not a number: as a literal it would make every pass compile kernels of its own.
+        radius = dr.opaque(mi.Float, self.radius)
+        image = None
+        taken = wavefront = 0
+        while taken < spp:
+            sampler = sensor.sampler().clone()
+            sampler.set_sample_count(min(per_wavefront, spp - taken))
+            count = sampler.sample_count()  # samplers may round it up
+            sampler.set_samples_per_wavefront(count)
+            seed = mi.sample_tea_32(stream_seed(self.seed, EYE, index), wavefront)[0]
+            sampler.seed(seed, pixels * count)
+
+            # --- Eye paths and density estimation ---
+            ray, ray_weight, position = films.sample_rays(sensor, sampler, count, colour)
+            dr.eval(ray, ray_weight, position)
+            seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
+            room = self.points.room
+            seen = scene.radiance(sampler, ray, map_, radius, seed, room, self.clock.lap)
+            for found in seen.gathered:
+                counts["gather_points"] += dr.width(found.lane)
+                counts["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
+                counts["gather_points_bounded"] += int(dr.count(found.bounded)[0])
+                counts["gather_points_off_surface"] += int(dr.count(found.lost)[0])
+                counts["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
+            self.points.seen(sum(dr.width(found.lane) for found in seen.gathered))
+
+            # --- Into the image ---
+            finite = dr.all(dr.isfinite(seen.L))
+            counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
+            L = dr.select(finite, seen.L, 0) * ray_weight
+            splats = films.splat(film, position, L, seen.valid, count, ray.wavelengths)
+            image = splats if image is None else image + splats
+            dr.eval(image)
+            self.clock.lap("film")
+            counts["eye_samples"] += pixels * count
+            counts["spp"] += count
+            taken += count
+            wavefront += 1
+            yield image, min(taken, spp)
+
+    # --- After a pass ---
+
+    def _check_error(self):
+        """Estimate the error after each pass, and rarer the more there are, if anybody asks."""
+        asked = self.scene.settings.target_error or self.controls.progress or self.controls.callback
+        if asked and self.stopping.is_checkpoint(self.done.counts["passes"]):
+            self._estimate_error()
+
+    def _estimate_error(self):
+        sums, count = self.done.sums, self.done.counts["passes"]
+        if count > 1 and sums.square is not None:
+            mean, self.variance = mean_and_variance(sums.arrays(), count)
+            self.statistics["relative_error"] = relative_standard_error(mean, self.variance)
+
+    def _report(self, index: int, part: float):
+        if self.controls.progress is None:
+            return
+        count, error = self.done.counts["passes"], self.statistics["relative_error"]
+        total = self.stopping.expected_total(count, error)
+        number = f"pass {index + 1}"
+        if self.scene.settings.passes:
+            number += f"/{self.controls.first_pass + self.scene.settings.passes}"
+        text = number + (f", error {error:.2%}" if error else "")
+        self.controls.progress(count + part if part < 1 else count, total, text)
+
+    def _after_pass(self, index: int):
+        checkpoint, callback = self.controls.checkpoint, self.controls.callback
+        due = checkpoint is not None and checkpoint.due()
+        if due or callback:
+            films.show(self.film, self.done.sums.film_tensor())
+        if callback:
+            callback(index, self.film.develop(), dict(self.statistics))
+        if due:
+            self._estimate_error()
+            checkpoint.write(self._state())
+            if checkpoint.on_write:
+                checkpoint.on_write()
+
+    def _state(self) -> state.State:
+        return state.State(
+            self.identity,
+            films.describe(self.film),
+            self.done.passes,
+            self.stopping.spent(),
+            self.statistics,
+            self.done.sums.arrays(),
         )
-        clock.lap("film")
-        statistics["eye_samples"] += pixels * count
-        statistics["spp"] += count
-        taken += count
-        wavefront += 1
-        yield min(taken, spp)
+
+    # --- At the end ---
+
+    def keep_unfinished(self) -> bool:
+        """After an interruption: is there a picture? Whole passes only, or the wavefronts of the
+        first one."""
+        if self.done.sums is None and self.unfinished is not None:
+            image, counts = self.unfinished
+            sums = Sums.zeros(image.shape, False).plus(image)
+            self.done = _Done(sums, [], counts | {"passes": 0})
+        return self.done.sums is not None
+
+    def finish(self):
+        """The picture into the film, the state to the disk."""
+        self.statistics |= self.done.counts
+        if self.done.sums is not None:
+            films.show(self.film, self.done.sums.film_tensor())
+        if self.done.passes:
+            self._estimate_error()
+            if self.controls.checkpoint:
+                self.controls.checkpoint.write(self._state())
 
 
 def _warn(statistics):
@@ -185,6 +416,11 @@ class _Clock:
     def __init__(self):
         self.seconds: dict[str, float] = {}
         self.last = time.perf_counter()
+
+    def go_on_from(self, seconds: dict[str, float]):
+        """Count on from an earlier run."""
+        for stage, spent in seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
 
     def lap(self, stage: str):
         dr.sync_thread()

@@ -27,6 +27,8 @@ class Settings:
     gather_roughness: float = 0.2
     photon_count: int = 250_000
     passes: int = 1
+    time: float = 0.0
+    target_error: float = 0.0
     alpha: float = 2 / 3
     initial_radius: float = 0.0
     edge_compensation: bool = True
@@ -58,8 +60,12 @@ class Settings:
                 f'"{self.map}"; remove one of them'
             )
         self._between("gather_roughness", 0.01, 1e30)
-        self._between("photon_count", 1, 2 * 10**8)
-        self._between("passes", 1, 10**7)
+        self._between("photon_count", 0, 2 * 10**8, "between 1 and 2e+08, or 0 (automatic)")
+        self._between("time", 0, 1e9, "0 (no limit) or a positive number of seconds")
+        self._between("target_error", 0, 1e3, "0 (no target) or a positive relative error")
+        endless = self.passes == 0 and not self.open_ended
+        words = 'between 1 and 1e+07, or 0 (no limit) where "time" or "target_error" is given'
+        self._between("passes", 0, 10**7, words, not endless)
         self._between("alpha", 0, 1, "above 0 and at most 1", self.alpha > 0)
         self._between("initial_radius", 0, 1e30, "0 (automatic) or a positive length")
         self._between("max_depth", -1, 10**6, "-1 (unlimited) or 1 and more", self.max_depth != 0)
@@ -79,6 +85,11 @@ class Settings:
                 f'aniso_pm: parameter "{name}" is {value}; '
                 f"it must be {words or f'between {low:g} and {high:g}'}"
             )
+
+    @property
+    def open_ended(self) -> bool:
+        """May rendering end before the last pass, by time or error?"""
+        return self.time > 0 or self.target_error > 0
 
     @property
     def depth_limit(self) -> int:

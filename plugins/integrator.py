@@ -8,10 +8,12 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 from aniso_pm import progressive
-from aniso_pm.pilot import automatic_radius
+from aniso_pm.pilot import automatic_photon_count, automatic_radius
 from aniso_pm.prepared import Unsupported, prepare
 from aniso_pm.settings import Settings
+from aniso_pm.state import Checkpoint
 
 
 class AnisoPhotonMapper:
@@ -76,12 +78,30 @@ class AnisoPhotonMapper:
 
      * - photon_count
        - |int|
-       - Light paths per pass. (Default: 250000)
+       - Light paths per pass. 0 chooses as many as are about as much work as the eye samples of a
+         pass, between 10,000 and 5 million; the choice is in ``statistics["photon_count"]``.
+         (Default: 250000)
 
      * - passes
        - |int|
        - Number of passes with fresh photons and fresh eye paths; the samples per pixel are the
-         total over all passes. (Default: 1)
+         total over all passes, shared evenly. 0 is without limit: passes go on until ``time`` or
+         ``target_error`` ends them, and each takes the samples per pixel that are given, but no
+         more than make 262,144 eye samples in all (and at least one a pixel).
+         (Default: 1, or 0 where ``time`` or ``target_error`` is given)
+
+     * - time
+       - |float|
+       - Seconds after which rendering ends, as near as whole passes allow. Compilation of kernels
+         is not counted; the first pass is always finished. 0 is no limit. (Default: 0)
+
+     * - target_error
+       - |float|
+       - Rendering ends once the relative standard error of the picture, estimated from the spread
+         of at least four passes, is this small: the root of the mean over pixels of
+         :math:`\sigma^2/(M^2+f^2)`, with a pixel's mean :math:`M` over its colours, the variance
+         :math:`\sigma^2` of that mean, and a tenth :math:`f` of the median of the lit pixels. Noise
+         only: bias is not in it. 0 is no target. (Default: 0)
 
      * - initial_radius
        - |float|
@@ -119,8 +139,16 @@ class AnisoPhotonMapper:
     surfaces, the diffuse part of ``plastic`` and ``roughplastic``, and surfaces whose roughness is
     at least ``gather_roughness``. Photons and eye paths walk on all others, as ``path`` does.
 
-    After ``render()`` the attribute ``statistics`` holds counts and timings. The attribute
-    ``progress`` may be set to a function (done, total, text) that is called after each pass.
+    After ``render()`` the attribute ``statistics`` holds counts and timings. After two passes or
+    more ``variance`` holds the variance of the picture (NumPy array, height × width × channels),
+    estimated from the spread of the passes; its root is the standard error.
+
+    Before ``render()`` these attributes may be set: ``progress``, a function (done, total, text)
+    that is called after each wavefront (see ``aniso_pm.progress.bar``); ``callback``, a function
+    (pass_index, image, statistics) that is called after each pass with the picture so far;
+    ``checkpoint``, an ``aniso_pm.state.Checkpoint`` that keeps the state of the rendering in a file
+    from which it can be resumed; ``first_pass``, the number of the first pass. Pass i is the same
+    whatever passes are rendered before or after it, or none.
 
     In spectral variants all photons and eye paths of a pass share four wavelengths, stratified over
     the passes: give at least 16 passes.
@@ -153,9 +181,15 @@ class AnisoPhotonMapper:
                     "samples per pixel say how much is rendered)"
                 )
         given = {f.name: props[f.name] for f in fields(Settings) if f.name in props}
+        if given.get("time") or given.get("target_error"):
+            given.setdefault("passes", 0)
         self.settings = Settings(**given)
         self.statistics: dict[str, Any] = {}
-        self.progress: Callable[[float, int, str], None] | None = None
+        self.variance: np.ndarray | None = None
+        self.progress: Callable[[float, int | None, str], None] | None = None
+        self.callback: Callable[[int, Any, dict], None] | None = None
+        self.checkpoint: Checkpoint | None = None
+        self.first_pass = 0
         self._last_map: tuple | None = None
         self._exposed: dict[str, Any] = {}
 
@@ -177,16 +211,21 @@ class AnisoPhotonMapper:
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Render the scene; see ``mi.Integrator.render``. With several passes ``spp`` is their
-        total."""
+        total, and without a limit to their number that of each."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[int(sensor)]
-        self.statistics, self._last_map = {}, None
+        self.statistics, self.variance, self._last_map = {}, None, None
         with dr.suspend_grad():
             prepared = prepare(scene, self.settings, self.hide_emitters)
-            map_, radius = progressive.render(
-                prepared, sensor, _as_int(seed), spp, self.progress or _silent, self.statistics
+            controls = progressive.Controls(
+                self.first_pass, self.progress, self.callback, self.checkpoint
             )
-            self._last_map = (scene, prepared, map_, radius)
+            done = progressive.render(
+                prepared, sensor, _as_int(seed), spp, controls, self.statistics
+            )
+            self.variance = done.variance
+            if done.map:
+                self._last_map = (scene, prepared, done.map, done.radius)
             image = sensor.film().develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)
@@ -209,6 +248,9 @@ class AnisoPhotonMapper:
                     "aniso_pm: in spectral variants this integrator cannot be sampled by another "
                     "one that draws wavelengths of its own; render with it directly"
                 )
+            if self.settings.photon_count == 0:
+                count = automatic_photon_count(prepared, ray, seed, dr.width(ray))
+                prepared = prepared.with_(photon_count=count)
             radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
             left = (scene, prepared, prepared.photon_map(seed, 0), radius)
         _, prepared, map_, radius = left
@@ -227,13 +269,10 @@ class AnisoPhotonMapper:
 
     # --- Ours ---
 
-    @property
-    def passes(self) -> int:
-        return self.settings.passes
-
-    @passes.setter
-    def passes(self, value: int):
-        self.settings = self.settings.with_(passes=value)
+    def stop_after(self, passes: int = 0, time: float = 0.0, target_error: float = 0.0) -> None:
+        """Replace the stopping rules by these, whichever comes first; 0 is no limit. Raises
+        ValueError for values out of range, and if there is no rule left."""
+        self.settings = self.settings.with_(passes=passes, time=time, target_error=target_error)
 
     def parameters(self) -> dict[str, Any]:
         """All parameters with their values, as they would be given in a scene."""
@@ -248,10 +287,6 @@ _NO_DERIVATIVES = (
     "aniso_pm: derivatives are not supported (density estimation is not differentiable with "
     'respect to where photons land); use "prb" for gradients'
 )
-
-
-def _silent(done, total, text):
-    """The progress function of those who do not ask for one."""
 
 
 def _as_int(seed) -> int:

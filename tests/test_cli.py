@@ -1,5 +1,6 @@
 """The program `aniso-pm` ends with the right status and one clear line, and keeps its word."""
 
+import contextlib
 import json
 import os
 import signal
@@ -14,6 +15,7 @@ import pytest
 from aniso_pm import __version__, cli
 from aniso_pm.errors import one_line
 from aniso_pm.output import plain
+from aniso_pm.state import State
 
 SCENE = """<scene version="3.0.0">
   <default name="spp" value="4"/>
@@ -109,6 +111,15 @@ def assert_one_line(result, *parts):
         (["render", "scene.xml", "-o", "a.exr", "-D", "max_depth=-9"], "max_depth"),
         (["render", "scene.xml", "-o", "a.exr", "-D", "width=0"], "no pixels"),
         (["render", "scene.xml", "-o", "a.exr", "--passes", "2"], "--passes"),
+        (["render", "scene.xml", "-o", "a.exr", "--time", "0"], "--time"),
+        (["render", "scene.xml", "-o", "a.exr", "--time", "9"], "--time: PathIntegrator"),
+        (["render", "scene.xml", "-o", "a.exr", "--target-error", "-1"], "--target-error"),
+        (["render", "scene.xml", "-o", "a.exr", "--resume"], "--resume or --keep-state"),
+        (["render", "scene.xml", "-o", "a.exr", "--first-pass", "3"], "--first-pass"),
+        (["merge", "-o", "a.exr"], "states"),
+        (["merge", "x.state", "-o", "a.exr"], "x.state"),
+        (["merge", "scene.xml", "-o", "a.exr"], "not a whole state file"),
+        (["merge", "x.state", "-o", "a.png"], ".exr"),
     ],
 )
 def test_wrong_usage_is_one_clear_line(run, scene, arguments, part):
@@ -221,6 +232,110 @@ def test_header_and_json_tell_how_the_picture_was_made(run, scene):
     assert written == {key: told[key] for key in written}
     assert told["parameters"]["photon_count"] == header["aniso_pm.parameters.photon_count"] == 20000
     assert told["parameters"]["passes"] == 2 and told["seed"] == 7 and told["statistics"]
+
+
+# --- Passes ---
+
+
+def channels(path):
+    """Name → pixels, float64."""
+    found = OpenEXR.File(str(path), separate_channels=True).channels()
+    return {name: channel.pixels.astype(np.float64) for name, channel in found.items()}
+
+
+def assert_same_picture(a, b):
+    """All channels equal, but for the order of float sums in threads (and its square in variances
+    that are differences)."""
+    a, b = channels(a), channels(b)
+    assert a.keys() == b.keys()
+    for name in a:
+        np.testing.assert_allclose(a[name], b[name], rtol=0.01, atol=1e-4, err_msg=name)
+
+
+def test_passes_leave_variance_and_standard_error_as_layers(run, scene, tmp_path):
+    assert run("render", scene(OURS), "-o", "a.exr", "--passes", "2", "--png")[0] == 0
+    found = channels("a.exr")
+    layers = ("", "variance.", "standard_error.")
+    assert set(found) == {layer + channel for layer in layers for channel in "RGBA"}
+    np.testing.assert_allclose(found["standard_error.G"] ** 2, found["variance.G"], rtol=1e-5)
+    assert found["variance.G"].mean() > 0
+    assert OpenEXR.File("a.exr").header()["aniso_pm.statistics.relative_error"][0] > 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.exr", "a.png", "scene.xml"]
+    run("render", scene(OURS), "-o", "b.exr")
+    assert set(channels("b.exr")) == set("RGBA")
+
+
+def test_passes_rendered_apart_merge_into_the_whole(run, scene):
+    path = scene(OURS)
+    options = ["--keep-state", "--quiet"]
+    run("render", path, "-o", "all.exr", "--passes", 5, "--spp", 10, *options)
+    run("render", path, "-o", "a.exr", "--passes", 2, "--spp", 4, *options)
+    run("render", path, "-o", "b.exr", "--passes", 2, "--spp", 4, "--first-pass", 2, *options)
+    run("render", path, "-o", "c.exr", "--passes", 1, "--spp", 2, "--first-pass", 4, *options)
+    status, stdout, stderr = run("merge", "a.state", "b.exr", "-o", "ab.exr")
+    assert (status, stdout, stderr) == (0, "", "")
+    status, stdout, _ = run("merge", "ab.exr", "c.exr", "-o", "abc.exr", "--png", "--json")
+    assert status == 0 and json.loads(stdout)["passes"] == [[0, 5]]
+    assert_same_picture("all.exr", "abc.exr")
+    assert mi.Bitmap("abc.png").pixel_format() == mi.Bitmap.PixelFormat.RGBA
+    assert_one_line(run("merge", "ab.exr", "a.exr", "-o", "d.exr"), "a.state", "pass 0 is already")
+    assert_one_line(run("merge", "a.exr", "a.state", "-o", "d.exr"), "named twice")
+    run("render", path, "-o", "s.exr", "--passes", 2, "--spp", 4, "--seed", 7, *options)
+    assert_one_line(run("merge", "a.exr", "s.exr", "-o", "d.exr"), "seed was 7, is 0")
+
+
+def test_the_command_line_replaces_the_scene_s_stopping_rules(run, scene):
+    path = scene(OURS.replace("</integrator>", '<integer name="passes" value="2"/></integrator>'))
+    _, stdout, _ = run("render", path, "-o", "a.exr", "--target-error", "0.5", "--json")
+    assert json.loads(stdout)["statistics"]["passes"] == 4
+    _, stdout, _ = run("render", path, "-o", "a.exr", "--time", "0.001", "--json")
+    assert json.loads(stdout)["statistics"]["passes"] == 1
+
+
+def test_a_damaged_or_foreign_state_is_refused_in_one_line(run, scene, tmp_path):
+    path = scene(OURS)
+    arguments = ["-o", "a.exr", "--passes", "2", "--resume"]
+    _, _, stderr = run("render", path, *arguments)
+    assert "starting afresh" in stderr
+    scene(OURS.replace("20000", "20001"))
+    assert_one_line(run("render", path, *arguments), "photon count was 20000, is 20001")
+    scene(OURS)
+    assert_one_line(run("render", path, *arguments, "-D", "max_depth=5"), "max_depth")
+    state = tmp_path / "a.state"
+    state.write_bytes(state.read_bytes()[:-100])
+    assert_one_line(run("render", path, *arguments), "a.state", "not a whole state file")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends POSIX signals")
+@pytest.mark.parametrize("kills", [1, pytest.param(20, marks=pytest.mark.slow)])
+def test_killed_at_any_moment_and_resumed_it_ends_in_the_same_picture(scene, tmp_path, kills):
+    path = scene(OURS)
+    arguments = ["render", path, "--passes", 150 * kills, "--spp", 150 * kills, "--quiet"]
+    whole = process(*arguments, "-o", "whole.exr", cwd=tmp_path)
+    assert whole.wait(timeout=600) == 0
+    arguments += ["-o", "a.exr", "--resume", "--save-every", "0.02"]
+    random = np.random.default_rng(kills)
+    done = []
+    for _ in range(kills):
+        # From before the first import to the midst of a write; the first time, wait for a state.
+        program = process(*arguments, cwd=tmp_path)
+        while not (tmp_path / "a.state").exists() and program.poll() is None:
+            time.sleep(0.1)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            program.wait(timeout=random.uniform(0, 4.0))
+        program.kill()
+        program.communicate()
+        with contextlib.suppress(FileNotFoundError):
+            done.append(State.load(tmp_path / "a.state").count)
+    assert done == sorted(done) and done[-1] > 0
+    print("passes after each kill:", done)
+    program = process(*arguments, cwd=tmp_path)
+    _, stderr = program.communicate(timeout=600)
+    assert program.returncode == 0, stderr
+    assert State.load(tmp_path / "a.state").passes == [[0, 150 * kills]]
+    assert_same_picture(tmp_path / "whole.exr", tmp_path / "a.exr")
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["a.exr", "a.state", "scene.xml", "whole.exr"]
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])

@@ -224,6 +224,7 @@ def test_a_real_interrupt_ends_in_a_picture(scene):
     import signal
 
     plugin = integrator(passes=1000)
+    mi.render(scene, integrator=integrator(passes=2), spp=2)  # compile
     handler = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
         for delay in (0.9, 1.3, 1.7):
@@ -393,7 +394,6 @@ def test_hidden_sky_stays_hidden_behind_null_surfaces_as_in_path(rgb, front):
         ("epsilon", 0.0, "between"),
         ("epsilon", float("nan"), "between"),
         ("max_aspect", 0.5, "between"),
-        ("photon_count", 0, "between"),
         ("photon_count", -5, "between"),
         ("photon_count", 1.5, "integer"),
         ("photon_count", "many", "integer"),

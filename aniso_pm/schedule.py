@@ -1,0 +1,65 @@
+"""What pass i takes: bandwidth, samples, wavelengths, each from i and the parameters alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .prepared import COLOUR, stream_seed
+from .settings import Settings
+
+# Eye samples of a pass where the number of passes is open: short against any budget.
+OPEN_PASS = 1 << 18
+
+
+def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
+    """Kernel radius of pass ``index`` (0-based): r² shrinks by (i + α)/(i + 1) after pass i.
+
+    ∏ (i + α)/(i + 1) for i = 1 … index is Γ(index + 1 + α) / (Γ(1 + α) Γ(index + 2)).
+    """
+    log_area = math.lgamma(index + 1 + alpha) - math.lgamma(1 + alpha) - math.lgamma(index + 2)
+    return initial_radius * math.exp(0.5 * log_area)
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Samples per pixel of each pass."""
+
+    each: int
+    one_more: range  # passes that take one sample more than the others
+    text: str
+
+    def __call__(self, index: int) -> int:
+        return self.each + (index in self.one_more)
+
+
+def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Shares:
+    """How the passes share ``spp`` samples per pixel.
+
+    With a fixed number of passes ``spp`` is the total, shared evenly. With ``passes = 0`` a pass
+    takes ``spp`` samples, but no more than make OPEN_PASS eye samples in all, and at least one.
+
+    Raises ValueError if there are fewer samples than passes, unless time or error may end them.
+    """
+    passes = settings.passes
+    if passes == 0:
+        each, rest = max(1, min(spp, OPEN_PASS // pixels)), 0
+    elif spp >= passes:
+        each, rest = divmod(spp, passes)
+    elif settings.open_ended:
+        each, rest = 1, 0
+    else:
+        raise ValueError(
+            f"aniso_pm: {spp} samples per pixel cannot be shared by {passes} passes; "
+            f'raise the sample count to {passes} or lower the parameter "passes"'
+        )
+    text = f"{spp} by {passes} from pass {first_pass}" if rest else str(each)
+    return Shares(each, range(first_pass, first_pass + rest), text)
+
+
+def wavelength_sample(seed: int, index: int) -> float:
+    """Which wavelengths pass ``index`` takes: a van der Corput sequence from a random start. Each
+    sample stands for four wavelengths a quarter apart, so it needs to cover a quarter only."""
+    start = stream_seed(seed, COLOUR) / 2**32
+    sequence = int(f"{index:032b}"[::-1], 2) / 2**32
+    return (start + sequence / 4) % 1

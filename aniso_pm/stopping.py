@@ -1,0 +1,96 @@
+"""When to stop: number of passes, time, estimated error, whichever comes first.
+
+Time is wall-clock time from the call on, without the compilation of kernels: that happens once, in
+the first pass, and depends on what is cached. Rendering ends as near to the limit as whole passes
+allow: one more begins if, by the mean of the last ones, half of it will lie within. The first pass
+always does.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import contextmanager
+
+import drjit as dr
+
+from .settings import Settings
+
+# Passes before which an error estimate says too little to stop.
+MIN_PASSES = 4
+# The error is looked at after passes that are this much apart: the estimate costs time.
+_STRIDE = math.log(1.05)
+# Passes whose mean duration predicts the next one.
+_RECENT = 4
+
+
+class Stopping:
+    """The stopping rules of one rendering, and the time it takes."""
+
+    def __init__(self, settings: Settings):
+        self.settings = settings
+        self.spent_before = 0.0  # by earlier runs that this one resumes
+        self._began = time.perf_counter()
+        self._compiling = 0.0
+        self._durations: list[float] = []
+        # A history that the caller keeps is the caller's; then compilation counts as rendering.
+        self._history = settings.time > 0 and not dr.flag(dr.JitFlag.KernelHistory)
+        if self._history:
+            dr.kernel_history_clear()
+            dr.set_flag(dr.JitFlag.KernelHistory, True)
+
+    @contextmanager
+    def measured(self):
+        """Around each pass."""
+        began, compiling = time.perf_counter(), self._compiling
+        yield
+        if self._history:
+            self._close_history()
+        took = time.perf_counter() - began - (self._compiling - compiling)
+        self._durations = [*self._durations[-_RECENT + 1 :], took]
+
+    def close(self):
+        """At the end, however it came."""
+        if self._history:
+            self._close_history()
+
+    def _close_history(self):
+        kernels = [k for k in dr.kernel_history() if "backend_time" in k]
+        self._compiling = sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
+        dr.set_flag(dr.JitFlag.KernelHistory, False)
+        dr.kernel_history_clear()
+        self._history = False
+
+    def spent(self) -> float:
+        """Seconds spent, earlier runs included, compilation not."""
+        return self.spent_before + time.perf_counter() - self._began - self._compiling
+
+    def is_checkpoint(self, count: int) -> bool:
+        """Is the error estimated after ``count`` passes? After each of the first 20, then at steps
+        of 5 %: a function of the count alone, so that a resumed rendering stops at the same one."""
+        return count > 1 and int(math.log(count) / _STRIDE) > int(math.log(count - 1) / _STRIDE)
+
+    def reached(self, count: int, error: float | None) -> bool:
+        """Is it time to stop, after ``count`` passes with this relative error?"""
+        if count == 0:
+            return False
+        s = self.settings
+        if s.time and self.spent() + 0.5 * self._expected_duration() > s.time:
+            return True
+        enough = count >= MIN_PASSES and error is not None and error <= s.target_error
+        return bool(s.target_error) and enough
+
+    def _expected_duration(self) -> float:
+        return sum(self._durations) / len(self._durations) if self._durations else 0.0
+
+    def expected_total(self, count: int, error: float | None) -> int | None:
+        """Passes in all as far as one can tell; None if nobody knows."""
+        s = self.settings
+        totals = [s.passes] if s.passes else []
+        if s.time and self._durations:
+            left = max(0.0, s.time - self.spent()) / self._expected_duration()
+            totals.append(count + int(left))
+        if s.target_error and error and count:
+            # The error falls as 1/√passes.
+            totals.append(math.ceil(count * max(1.0, (error / s.target_error) ** 2)))
+        return max(1, count, min(totals)) if totals else None

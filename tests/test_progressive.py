@@ -1,0 +1,676 @@
+"""Passes: pure, summed with their variance, stopped by time or error, kept in a state file."""
+
+import json
+import math
+import time
+from pathlib import Path
+
+import aniso_pm  # noqa: F401
+import drjit as dr
+import matrix
+import mitsuba as mi
+import numpy as np
+import pytest
+from aniso_pm import progress, progressive, schedule
+from aniso_pm.accumulate import Sums, mean_and_variance, relative_standard_error
+from aniso_pm.settings import Settings
+from aniso_pm.state import Checkpoint, State, StateError, describe, merge
+from aniso_pm.stopping import Stopping
+from rooms import room, room_with_plate
+
+SMALL = {"type": "aniso_pm", "photon_count": 3000, "initial_radius": 0.15}
+
+
+@pytest.fixture(autouse=True)
+def _variant(variant_llvm_rgb):
+    pass
+
+
+def integrator(**parameters):
+    return mi.load_dict(SMALL | parameters)
+
+
+def load(size=8, filter_="box", make=room_with_plate):
+    definition = make(size)
+    definition["sensor"]["film"]["rfilter"] = {"type": filter_}
+    # Merged meshes come in the order of their addresses, and random decisions with them.
+    return mi.load_dict(definition, optimize=False)
+
+
+def render(scene, plugin, spp, seed=1, first_pass=0, checkpoint=None):
+    plugin.first_pass, plugin.checkpoint = first_pass, checkpoint
+    return np.array(plugin.render(scene, seed=seed, spp=spp), dtype=np.float64)
+
+
+def close(a, b):
+    """Equal up to the order of float sums, in which threads add photons and samples."""
+    np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4)
+
+
+# --- Pure passes ---
+
+
+def test_bandwidth_is_the_product_of_the_ratios():
+    area = 1.0
+    for i in range(300):
+        assert schedule.bandwidth(2.0, 2 / 3, i) == pytest.approx(2 * area**0.5, rel=1e-9)
+        area *= (i + 1 + 2 / 3) / (i + 2)
+
+
+@pytest.mark.parametrize("filter_", ["box", "gaussian"])
+def test_passes_rendered_one_by_one_add_up_to_the_picture(filter_):
+    """The mean over passes, each weighted by the reconstruction filter's weights of its samples."""
+    scene = load(filter_=filter_)
+    together = render(scene, integrator(passes=4), 8)
+    film = scene.sensors()[0].film()
+    total = 0.0
+    for i in range(4):
+        render(scene, integrator(), 2, first_pass=i)
+        total = total + np.array(film.develop(raw=True), dtype=np.float64)
+    close(total[..., :-1] / total[..., -1:], together)
+
+
+def test_a_pass_does_not_depend_on_how_many_there_are():
+    scene = load()
+    three, four = (render(scene, integrator(passes=n), 2 * n) for n in (3, 4))
+    last = render(scene, integrator(), 2, first_pass=3)
+    close(4 * four - 3 * three, last)
+
+
+def test_passes_differ_from_each_other_and_between_seeds():
+    scene = load()
+    images = [render(scene, integrator(), 2, seed, i) for seed, i in ((1, 0), (1, 1), (2, 0))]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert np.abs(images[a] - images[b]).mean() > 0.01
+
+
+@pytest.mark.parametrize(
+    "parameters, spp, pixels, each",
+    [
+        ({"passes": 4}, 10, 100, [3, 3, 2, 2]),
+        ({"passes": 1}, 7, 100, [7]),
+        ({"passes": 0, "time": 9.0}, 7, 100, [7, 7]),
+        ({"passes": 0, "time": 9.0}, 64, 2**14, [16, 16]),
+        ({"passes": 0, "target_error": 0.1}, 64, 2**20, [1, 1]),
+        ({"passes": 100, "time": 9.0}, 7, 100, [1, 1]),
+    ],
+)
+def test_samples_are_shared_evenly_and_open_ends_take_short_passes(parameters, spp, pixels, each):
+    shares = schedule.shares(Settings(**parameters), spp, pixels)
+    assert [shares(i) for i in range(len(each))] == each
+
+
+def test_automatic_photon_count_balances_the_work_of_a_pass():
+    """Twice the eye samples, twice the light paths; as counted by hand from the statistics."""
+    scene = load(64)
+    chosen = {}
+    for spp in (16, 32):
+        plugin = integrator(photon_count=0)
+        render(scene, plugin, spp)
+        s = plugin.statistics
+        assert s["photon_count_automatic"] and s["photon_count"] == s["photons_emitted"]
+        light = s["photons_emitted"] + s["photons_stored"]
+        assert light == pytest.approx(s["eye_samples"] + s["gather_points"], rel=0.1)
+        chosen[spp] = s["photon_count"]
+    assert chosen[32] == pytest.approx(2 * chosen[16], rel=0.06)  # two digits
+
+
+def test_automatic_photon_count_is_kept_when_resuming(tmp_path):
+    path = tmp_path / "a.state"
+    scene = load(48)
+    render(scene, integrator(photon_count=0, passes=2), 8, checkpoint=Checkpoint(path))
+    state = State.load(path)
+    chosen = state.identity["photon count"]
+    state.identity["photon count"] = chosen + 1
+    state.save(path)
+    plugin = integrator(photon_count=0, passes=3)
+    render(scene, plugin, 12, checkpoint=Checkpoint(path, resume=True))
+    assert plugin.statistics["photons_emitted"] == 3 * chosen + 1
+
+
+# --- Variance ---
+
+
+def test_variance_of_equal_passes_is_the_textbook_one():
+    """With a box filter all weights are equal: the sample variance of the mean of the passes."""
+    scene = load()
+    passes = np.array([render(scene, integrator(), 2, first_pass=i) for i in range(6)])
+    plugin = integrator(passes=6)
+    render(scene, plugin, 12)
+    expected = passes.var(axis=0, ddof=1) / 6
+    np.testing.assert_allclose(plugin.variance, expected, rtol=0.02, atol=1e-7)
+
+
+def test_variance_of_a_ratio_is_the_jackknife_s():
+    """Weights that differ from pass to pass: delete-one jackknife of Σ A / Σ W, which agrees with
+    the linearised variance up to terms of relative order 1/m."""
+    rng = np.random.default_rng(3)
+    m = 400
+    weight = rng.uniform(0.2, 2.0, (m, 3, 3, 1))
+    value = np.concatenate([weight * rng.gamma(2.0, 1.0, (m, 3, 3, 2)), weight], axis=3)
+    sums = Sums.zeros(value.shape[1:], True)
+    for image in value:
+        sums = sums.plus(mi.TensorXf(image.astype(np.float32)))
+    mean, variance = mean_and_variance(sums.arrays(), m)
+    left_out = value.sum(0) - value
+    ratios = left_out[..., :-1] / left_out[..., -1:]
+    jackknife = (m - 1) / m * ((ratios - ratios.mean(0)) ** 2).sum(0)
+    np.testing.assert_allclose(mean, value.sum(0)[..., :-1] / value.sum(0)[..., -1:], rtol=1e-6)
+    np.testing.assert_allclose(variance, jackknife, rtol=5 / m)
+
+
+@pytest.mark.parametrize("filter_", ["gaussian", pytest.param("lanczos", marks=pytest.mark.slow)])
+def test_variance_predicts_the_spread_between_seeds(filter_):
+    """24 pictures: a pixel's sample variance has a standard error of 29 % and a median 3 % below
+    its mean; of the median over 192 values, correlated as they are, a few per cent remain. (Their
+    mean would be that of the four pixels at the lamp's edge.)"""
+    scene = load(filter_=filter_)
+    images, predicted = [], []
+    for seed in range(24):
+        plugin = integrator(passes=5)
+        images.append(render(scene, plugin, 10, seed))
+        predicted.append(plugin.variance)
+    ratio = np.mean(predicted, axis=0) / np.var(images, axis=0, ddof=1)
+    assert np.median(ratio) == pytest.approx(1.03, abs=0.15)
+
+
+def test_one_pass_has_no_variance():
+    plugin = integrator()
+    render(load(), plugin, 2)
+    assert plugin.variance is None and plugin.statistics["relative_error"] is None
+
+
+def test_relative_error_is_scale_free_and_not_hidden_by_a_lamp():
+    mean, variance = np.ones((10, 10, 3)), np.full((10, 10, 3), 0.04)
+    expected = 0.2 / math.sqrt(1.01)  # σ = 0.2, M = 1, f = 0.1
+    assert relative_standard_error(mean, variance) == pytest.approx(expected)
+    assert relative_standard_error(7 * mean, 49 * variance) == pytest.approx(expected)
+    mean[0, 0] = 1e4
+    assert relative_standard_error(mean, variance) == pytest.approx(expected, rel=0.01)
+    assert relative_standard_error(0 * mean, variance) == 0
+
+
+# --- Stopping ---
+
+
+def test_time_ends_rendering():
+    plugin = integrator(time=1.0)
+    assert plugin.parameters()["passes"] == 0
+    scene = load(16)
+    render(scene, integrator(passes=2), 32)  # compile
+    began = time.perf_counter()
+    image = render(scene, plugin, 16)
+    took = time.perf_counter() - began
+    assert plugin.statistics["passes"] > 2 and np.isfinite(image).all()
+    # A pass takes some 20 ms here; the rest is for a machine with other things to do.
+    assert 0.7 < took < 1.5
+
+
+def test_compilation_does_not_count_as_rendering(monkeypatch):
+    """Kernels that take 100 s to compile leave a 1 s budget untouched."""
+    rules = Stopping(Settings(passes=0, time=1.0))
+    with rules.measured():
+        time.sleep(0.05)
+        kernel = {"codegen_time": 40.0, "backend_time": 1e5 - 40}
+        monkeypatch.setattr(dr, "kernel_history", lambda: [kernel])
+    assert not dr.flag(dr.JitFlag.KernelHistory)
+    assert rules.spent() == pytest.approx(0.05 - 100, abs=0.1)
+
+
+def test_the_number_of_passes_still_ends_a_long_budget():
+    plugin = integrator(time=1000.0, passes=3)
+    render(load(), plugin, 6)
+    assert plugin.statistics["passes"] == 3 and plugin.statistics["spp"] == 6
+
+
+def test_target_error_ends_rendering_where_it_says():
+    scene = load()
+    plugin = integrator(target_error=0.1)
+    render(scene, plugin, 4)
+    count = plugin.statistics["passes"]
+    assert plugin.statistics["relative_error"] <= 0.1 and count > 4
+    fewer = integrator(passes=int(count * 0.9))
+    render(scene, fewer, 4 * fewer.settings.passes)
+    assert fewer.statistics["relative_error"] > 0.1
+
+
+def test_nothing_to_see_reaches_any_target():
+    definition = room(size=4)
+    del definition["light"]["emitter"]
+    plugin = integrator(target_error=0.5)
+    plugin.render(mi.load_dict(definition), spp=2)
+    assert plugin.statistics["passes"] == 4
+
+
+def test_passes_without_any_end_are_refused():
+    with pytest.raises(Exception, match='"passes" is 0.*"time" or "target_error"'):
+        mi.load_dict(SMALL | {"passes": 0})
+    plugin = integrator(passes=3)
+    plugin.stop_after(time=2.0)
+    assert plugin.parameters()["passes"] == 0 and plugin.parameters()["time"] == 2
+    with pytest.raises(ValueError, match="passes"):
+        plugin.stop_after()
+
+
+# --- What programs see ---
+
+
+def test_callback_gets_every_pass_with_the_picture_so_far():
+    calls = []
+    plugin = integrator(passes=3)
+    plugin.callback = lambda i, image, statistics: calls.append((i, np.array(image), statistics))
+    scene = load()
+    final = render(scene, plugin, 6, first_pass=2)
+    assert [i for i, _, _ in calls] == [2, 3, 4]
+    assert [s["passes"] for _, _, s in calls] == [1, 2, 3]
+    assert calls[0][2]["relative_error"] is None and calls[1][2]["relative_error"] > 0
+    close(calls[-1][1], final)
+    close(calls[0][1], render(scene, integrator(), 2, first_pass=2))
+
+
+def test_progress_bar_counts_passes_and_tells_the_error(capsys):
+    plugin = integrator(passes=4)
+    with progress.bar(plugin, mininterval=0):
+        render(load(), plugin, 8)
+    assert plugin.progress is None
+    shown = capsys.readouterr().err
+    assert "pass 4/4, error " in shown and " 4/4 [" in shown
+
+
+def test_interruption_between_photons_and_eye_paths_leaves_whole_passes():
+    plugin = integrator(passes=4)
+
+    def interrupt(done, total, text):
+        if done == 2:
+            plugin.progress = None
+            raise KeyboardInterrupt
+
+    plugin.progress = interrupt
+    scene = load()
+    image = render(scene, plugin, 8)
+    assert plugin.statistics["interrupted"] and plugin.statistics["passes"] == 2
+    close(image, render(scene, integrator(passes=2), 4))
+    assert plugin.variance.shape == image.shape
+
+
+# --- State ---
+
+
+@pytest.fixture
+def states(tmp_path):
+    """Files with passes 0-1 and 2-3, and the picture of all four."""
+    scene = load()
+    paths = [tmp_path / "a.state", tmp_path / "b.state"]
+    for path, first in zip(paths, (0, 2), strict=True):
+        render(scene, integrator(passes=2), 4, 1, first, Checkpoint(path))
+    return paths, scene, render(scene, integrator(passes=4), 8)
+
+
+def test_states_merge_into_the_picture_of_all_passes(states):
+    paths, scene, whole = states
+    for order in (paths, paths[::-1]):
+        total = merge({path.name: State.load(path) for path in order})
+        assert total.passes == [[0, 4]] and total.statistics["spp"] == 8
+        assert total.statistics["photons_emitted"] == 4 * 3000
+        close(total.arrays["first"][..., :-1] / total.arrays["first"][..., -1:], whole)
+    plugin = integrator(passes=4)
+    render(scene, plugin, 8)
+    np.testing.assert_allclose(total.variance(), plugin.variance, rtol=0.02, atol=1e-7)
+
+
+def test_resuming_renders_the_missing_passes_only(states):
+    paths, scene, whole = states
+    plugin = integrator(passes=4)
+    seen = []
+    plugin.callback = lambda i, image, statistics: seen.append(i)
+    image = render(scene, plugin, 8, checkpoint=Checkpoint(paths[1], resume=True))
+    assert seen == [0, 1]
+    close(image, whole)
+    assert plugin.statistics["passes"] == 4 and plugin.statistics["spp"] == 8
+    seen.clear()
+    close(render(scene, plugin, 8, checkpoint=Checkpoint(paths[1], resume=True)), whole)
+    assert seen == []
+
+
+def test_resuming_keeps_the_bandwidth_that_the_pilot_chose(tmp_path):
+    path = tmp_path / "a.state"
+    scene = load()
+    render(scene, integrator(passes=2, initial_radius=0.0), 4, checkpoint=Checkpoint(path))
+    state = State.load(path)
+    chosen = state.identity["initial radius"]
+    state.identity["initial radius"] = 0.5 * chosen
+    state.save(path)
+    plugin = integrator(passes=3, initial_radius=0.0)
+    render(scene, plugin, 6, checkpoint=Checkpoint(path, resume=True))
+    assert plugin.statistics["initial_radius"] == 0.5 * chosen
+
+
+def test_resuming_a_time_budget_counts_what_was_spent(tmp_path):
+    path = tmp_path / "a.state"
+    scene = load()
+    render(scene, integrator(passes=2), 4, checkpoint=Checkpoint(path))
+    state = State.load(path)
+    state.seconds = 100.0
+    state.save(path)
+    plugin = integrator(time=50.0)
+    render(scene, plugin, 2, checkpoint=Checkpoint(path, resume=True))
+    assert plugin.statistics["passes"] == 2
+
+
+@pytest.mark.parametrize(
+    "change, named",
+    [
+        ({"rule": "taylor"}, 'parameter "rule" was lobe, is taylor'),
+        ({"photon_count": 3001}, "photon count was 3000, is 3001"),
+        ({"initial_radius": 0.2}, "initial radius was 0.15, is 0.2"),
+        ({"hide_emitters": True}, 'parameter "hide_emitters" was False, is True'),
+    ],
+)
+def test_other_parameters_are_refused_by_name(states, change, named):
+    paths, scene, _ = states
+    with pytest.raises(StateError, match=named):
+        render(scene, integrator(passes=4, **change), 8, checkpoint=Checkpoint(paths[0], 30, True))
+
+
+@pytest.mark.parametrize(
+    "options, named",
+    [
+        ({"seed": 2}, "seed was 1, is 2"),
+        ({"spp": 12}, "samples per pass was 2, is 3"),
+        ({"first_pass": 1}, "holds passes 0-1, but passes 1-4 are asked for"),
+    ],
+)
+def test_other_passes_are_refused_by_name(states, options, named):
+    paths, scene, _ = states
+    options = {"spp": 8, "seed": 1, "first_pass": 0} | options
+    with pytest.raises(StateError, match=named):
+        render(scene, integrator(passes=4), checkpoint=Checkpoint(paths[0], 30, True), **options)
+
+
+def _brighter(definition):
+    definition["light"]["emitter"]["radiance"]["value"] = [8, 7.5, 7.1]
+
+
+def _moved(definition):
+    T = mi.ScalarTransform4f
+    definition["floor"]["to_world"] = T().translate([0, 1e-4, 0]) @ definition["floor"]["to_world"]
+
+
+def _other_distribution(definition):
+    definition["plate"]["bsdf"]["bsdf"]["distribution"] = "ggx"
+
+
+def _without(definition):
+    del definition["left"]
+
+
+def _turned(definition):
+    definition["sensor"]["fov"] = 75.01
+
+
+def _cropped(definition):
+    definition["sensor"]["film"] |= {"width": 9}
+
+
+@pytest.mark.parametrize(
+    "change, named",
+    [
+        (_brighter, "scene, light has changed"),
+        (_moved, "scene, floor has changed"),
+        (_other_distribution, "scene, plate has changed"),
+        (_without, "scene, left is only in the other one"),
+        (_turned, "camera has changed"),
+        (_cropped, "film size was 8x8, is 9x8"),
+    ],
+)
+def test_another_scene_is_refused_by_what_changed(states, change, named):
+    paths, _, _ = states
+    definition = room_with_plate(8)
+    change(definition)
+    scene = mi.load_dict(definition, optimize=False)
+    with pytest.raises(StateError, match=named):
+        render(scene, integrator(passes=4), 8, checkpoint=Checkpoint(paths[0], 30, True))
+
+
+def test_the_same_scene_is_recognised_whatever_the_order_of_its_objects(states):
+    """Meshes are merged in the order of their addresses, and computed normals are sums in the
+    order of threads: neither is a different scene."""
+    from aniso_pm.digest import scene_entries
+
+    definition = room_with_plate(8)
+    backwards = dict(reversed(definition.items()))
+    first, second = (mi.load_dict(d, optimize=False) for d in (definition, backwards))
+    assert scene_entries(first) == scene_entries(second)
+    assert len(scene_entries(first)) == 8
+
+
+def test_a_texture_is_part_of_the_scene(tmp_path):
+    from aniso_pm.digest import scene_entries
+
+    def entries(value):
+        data = mi.TensorXf(np.full((4, 4, 3), value, dtype=np.float32))
+        texture = {"type": "bitmap", "data": data, "raw": True}
+        bsdf = {"type": "diffuse", "reflectance": texture}
+        return scene_entries(mi.load_dict({"type": "scene", "a": {"type": "sphere", "bsdf": bsdf}}))
+
+    assert entries(0.5) == entries(0.5) != entries(0.50001)
+
+
+def test_overlapping_and_foreign_states_do_not_merge(states):
+    paths, scene, _ = states
+    a, b = (State.load(path) for path in paths)
+    with pytest.raises(StateError, match="c: pass 0 is already"):
+        merge({"a": a, "b": b, "c": a})
+    other = State.load(paths[1])
+    other.identity["seed"] = 9
+    with pytest.raises(StateError, match="b and a.*seed was 9, is 1"):
+        merge({"a": a, "b": other})
+    assert describe([[0, 8], [16, 17]]) == "0-7, 16"
+
+
+def test_damaged_states_are_never_read_as_data(states):
+    """Truncated anywhere, any bit flipped (but for bits that zip does not use), or not a state."""
+    path = states[0][0]
+    data = path.read_bytes()
+    whole = State.load(path)
+    rng = np.random.default_rng(0)
+    for length in [0, 1, 100, len(data) - 1, *rng.integers(0, len(data), 40)]:
+        path.write_bytes(data[:length])
+        with pytest.raises(StateError, match="delete it to start afresh"):
+            State.load(path)
+    refused = 0
+    for position in rng.integers(0, len(data), 200):
+        flipped = bytearray(data)
+        flipped[position] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        try:
+            state = State.load(path)
+        except StateError:
+            refused += 1
+            continue
+        # Time stamps and attributes of the archive: what is read is what was written.
+        assert state.identity == whole.identity and state.passes == whole.passes
+        assert all((state.arrays[k] == whole.arrays[k]).all() for k in whole.arrays)
+    assert refused > 150
+
+
+def test_a_consistent_archive_with_a_changed_value_is_refused(states):
+    path = states[0][0]
+    with np.load(path) as archive:
+        content = dict(archive)
+    content["first"][0, 0, 0] += 1
+    with open(path, "wb") as file:
+        np.savez(file, **content)
+    with pytest.raises(StateError, match="checksum"):
+        State.load(path)
+    content["header"] = np.array(json.dumps(json.loads(str(content["header"])) | {"version": 99}))
+    with open(path, "wb") as file:
+        np.savez(file, **content)
+    with pytest.raises(StateError, match="format 99"):
+        State.load(path)
+
+
+def test_state_and_picture_are_saved_on_the_way(tmp_path):
+    path = tmp_path / "a.state"
+    written = []
+    plugin = integrator(passes=5)
+    hook = lambda: written.append(State.load(path).passes)  # noqa: E731
+    render(load(), plugin, 5, checkpoint=Checkpoint(path, 0.0, on_write=hook))
+    # Saving may take no more than a twentieth of the time: not necessarily after every pass.
+    assert written and written[0][0][0] == 0
+    assert State.load(path).passes == [[0, 5]]
+    assert [p.name for p in Path(tmp_path).iterdir()] == ["a.state"]
+
+
+def test_checkpoints_of_films_with_alpha_crop_and_other_colours(tmp_path):
+    definition = room(size=8)
+    definition["sensor"]["film"] |= {"pixel_format": "luminance_alpha", "crop_width": 5}
+    scene = mi.load_dict(definition, optimize=False)
+    path = tmp_path / "a.state"
+    image = render(scene, integrator(passes=2), 4, checkpoint=Checkpoint(path))
+    state = State.load(path)
+    from aniso_pm import film as films
+
+    film = films.from_description(state.film)
+    films.show_array(film, state.arrays["first"])
+    assert image.shape == (8, 5, 2)
+    close(np.array(film.develop()), image)
+    assert state.variance().shape == (8, 5, 4)
+
+
+# --- Long runs ---
+
+
+@pytest.mark.slow
+def test_a_thousand_passes_need_no_more_memory_than_fifty():
+    import resource
+
+    scene = load(16)
+    render(scene, integrator(passes=50), 50)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    allocated = []
+    plugin = integrator(passes=1000)
+    plugin.callback = lambda i, image, statistics: allocated.append(_resident())
+    render(scene, plugin, 1000)
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert after - before < 20_000  # kB
+    early, late = np.mean(allocated[50:150]), np.mean(allocated[-100:])
+    print(f"resident: {early / 1e6:.1f} MB around pass 100, {late / 1e6:.1f} MB at the end")
+    assert late < 1.02 * early
+
+
+def _resident() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return 4096 * pages
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["teapot", "fry_pan", "glass_balls"])
+def test_later_passes_cost_python_less_than_20_ms(name):
+    """Processor time of the main thread, whatever else the machine does: tracing, launching and
+    what it computes itself while it waits."""
+    path = Path(__file__).parents[1] / "scenes" / f"{name}.xml"
+    scene = mi.load_file(str(path), width="32", height="24", optimize=False)
+    plugin = integrator(passes=40, photon_count=1000)
+    times = []
+    plugin.callback = lambda *_: times.append(time.thread_time())
+    render(scene, plugin, 40)
+    typical = np.median(np.diff(times))
+    print(f"{name}: {1e3 * typical:.1f} ms a pass")
+    assert plugin.statistics["replayed"] and typical < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.01, 1, 1000])
+def test_automatic_radius_suits_a_coin_and_a_stadium(scale):
+    """Sixty photons a kernel in the median of the light. In a room of 24 square units, evenly lit,
+    that is a kernel area π(2r)² = 24 · 60/photons; light is brightest where kernels are smaller."""
+    definition = room(size=16)
+    T = mi.ScalarTransform4f
+    for name, part in definition.items():
+        if isinstance(part, dict) and "to_world" in part:
+            if name == "sensor":
+                origin, target = [0, 0, 0.97 * scale], [0, -0.15 * scale, 0]
+                part["to_world"] = T().look_at(origin=origin, target=target, up=[0, 1, 0])
+                part["near_clip"], part["far_clip"] = 1e-3 * scale, 1e3 * scale
+            else:
+                part["to_world"] = T().scale(scale) @ part["to_world"]
+    plugin = integrator(initial_radius=0.0, photon_count=50_000)
+    render(mi.load_dict(definition), plugin, 4)
+    s = plugin.statistics
+    print(f"scale {scale}: radius {s['initial_radius']:.4g}")
+    even = math.sqrt(24 * 60 / s["photons_stored"] / (4 * math.pi))
+    assert 0.5 * even < s["initial_radius"] / scale < even
+    assert 30 < s["photons_gathered"] / s["gather_points"] < 120
+
+
+@pytest.mark.slow
+def test_a_ten_second_budget_ends_within_a_second_of_ten():
+    path = Path(__file__).parents[1] / "scenes" / "teapot.xml"
+    scene = mi.load_file(str(path), width="320", height="240")
+    plugin = scene.integrator()
+    plugin.stop_after(passes=1)
+    plugin.render(scene, spp=1)  # compile
+    plugin.stop_after(time=10.0)
+    began = time.perf_counter()
+    plugin.render(scene)
+    took = time.perf_counter() - began
+    print(f"{took:.2f} s, {plugin.statistics['passes']} passes")
+    assert 9 < took < 11
+
+
+# --- Replayed paths ---
+
+USES = {"global": {}, "caustic": {"map": "caustic"}, "final gather": {"final_gather": True}}
+
+
+def passes_by_themselves(scene, parameters, count):
+    """The picture of ``count`` passes of one sample, each traced in Python for itself."""
+    film = scene.sensors()[0].film()
+    total = 0.0
+    for i in range(count):
+        render(scene, integrator(**parameters), 1, first_pass=i)
+        total = total + np.array(film.develop(raw=True), dtype=np.float64)
+    return total[..., :-1] / total[..., -1:]
+
+
+def assert_replayed_right(name, use):
+    """Nothing of the first pass is frozen that belongs to that pass alone."""
+    scene = matrix.make(matrix.rows()[name], 8)
+    plugin = integrator(passes=4, **USES[use])
+    together = render(scene, plugin, 4)
+    alone = passes_by_themselves(scene, USES[use], 4)
+    # A path that rounding sends another way changes its pixel; there are few.
+    different = np.abs(together - alone) > 2e-3 * np.abs(alone) + 2e-4
+    print(f"{name}, {use}: {different.mean():.3f} differ, {plugin.statistics['replayed']=}")
+    assert different.mean() < 0.03
+    return plugin.statistics["replayed"]
+
+
+@pytest.mark.parametrize("use", USES)
+def test_replayed_passes_are_those_that_python_traces(use):
+    assert assert_replayed_right("roughplastic floor under glass", use)
+
+
+def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
+    """An error while Dr.Jit records costs time, not the picture; any other error is raised."""
+
+    def fail(*arguments):
+        raise RuntimeError("cannot be recorded")
+
+    monkeypatch.setattr(dr, "freeze", lambda function: fail)
+    scene = load()
+    plugin = integrator(passes=3)
+    image = render(scene, plugin, 6)
+    assert plugin.statistics["replayed"] is False and plugin.statistics["passes"] == 3
+    monkeypatch.undo()
+    close(image, render(scene, integrator(passes=3), 6))
+    monkeypatch.setattr(progressive.films, "splat", fail)
+    with pytest.raises(RuntimeError, match="cannot be recorded"):
+        render(scene, integrator(passes=3), 6)
+
+
+@pytest.mark.slow
+def test_every_scene_of_the_matrix_is_replayed_right():
+    replayed = {(n, use): assert_replayed_right(n, use) for n in matrix.rows() for use in USES}
+    assert sum(replayed.values()) > 0.9 * len(replayed)
