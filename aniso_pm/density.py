@@ -105,18 +105,19 @@ def estimate(
     allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
 
     def visit(total, slot, word, rho2, inside):
-        irradiance, count = total
+        irradiance, missing, count = total
         inside &= dr.dot(decode_normal(word), n) > NORMAL_COS
         if max_depth:
             inside &= segments(word) <= allowed
         weight = dr.select(inside, dr.exp(-rho2), 0)
-        return (
-            irradiance + weight * photon_flux(photons, slot, inside),
-            count + dr.select(inside, mi.UInt32(1), 0),
-        )
+        # Kahan's sum: what rounding took from the total goes into the next term. A plain sum is
+        # off by 1 % after a million equal photons.
+        term = weight * photon_flux(photons, slot, inside) - missing
+        sum_ = irradiance + term
+        return sum_, (sum_ - irradiance) - term, count + dr.select(inside, mi.UInt32(1), 0)
 
-    total = (mi.Spectrum(0), mi.UInt32(0))
-    irradiance, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active)
+    total = (mi.Spectrum(0), mi.Spectrum(0), mi.UInt32(0))
+    irradiance, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active)
     area = dr.pi * dr.sqrt(dr.squared_norm(kernel.s)) * dr.sqrt(dr.squared_norm(kernel.t))
     return points.weight * irradiance / (area * (KERNEL_MASS * photons.emitted)), count
 
