@@ -54,26 +54,34 @@ class KernelOptions:
 class Gathered:
     """What density estimation found, one lane a gather point.
 
-    radiance  reflected radiance, W/m²/sr.
-    photons   photons inside the kernel.
-    follows   the kernel follows a lobe (else it is the disc).
-    bounded   the lobe's kernel met the aspect cap or the grazing clamp.
-    lost      no part of the kernel was found to lie on the surface.
+    radiance    reflected radiance, W/m²/sr.
+    photons     photons inside the kernel.
+    follows     the kernel follows a lobe (else it is the disc).
+    clamped     it does, and the plane was so far edge-on that |r·n| was clamped.
+    capped      it does, and met the aspect cap.
+    degenerate  there is a lobe that cannot be followed: the disc.
+    lost        no part of the kernel was found to lie on the surface.
     """
 
     radiance: Any
     photons: Any
     follows: Any
-    bounded: Any
+    clamped: Any
+    capped: Any
+    degenerate: Any
     lost: Any
 
 
-def kernels(points: GatherPoints, radius, options: KernelOptions) -> tuple[PlaneKernel, Any]:
-    """(kernel, follows a lobe?) of each gather point; the disc where there is no lobe to follow."""
+def kernels(points: GatherPoints, radius, options: KernelOptions) -> tuple[PlaneKernel, Any, Any]:
+    """(kernel, follows a lobe?, lobe that cannot be followed?) of each gather point.
+
+    The disc where there is no lobe to follow, and where it cannot be followed: r is behind the
+    lobe (r·z <= 0), or the ellipse is not finite.
+    """
     round_ = disc(points.n, radius)
     path = points.path
     if not options.anisotropic or path is None:
-        return round_, mi.Bool(False)
+        return round_, mi.Bool(False), mi.Bool(False)
     shaped = guarded_axes(
         path.lobe,
         path.r,
@@ -86,9 +94,11 @@ def kernels(points: GatherPoints, radius, options: KernelOptions) -> tuple[Plane
         options.max_aspect,
         options.size,
     )
-    usable = path.valid & dr.isfinite(dr.sum(shaped.s) + dr.sum(shaped.t))
+    usable = dr.dot(path.r, path.lobe.z) > 0
+    usable &= dr.isfinite(dr.sum(shaped.s) + dr.sum(shaped.t))
     usable &= dr.squared_norm(shaped.t) > 0
-    return dr.select(usable, shaped, round_), usable
+    follows = path.valid & usable
+    return dr.select(follows, shaped, round_), follows, path.valid & ~usable
 
 
 def estimate(

@@ -39,6 +39,8 @@ from .warp import symmetric_eigen
 RULES = ("taylor", "paper", "lobe")
 # Share of the disc that the guard adds, in units of the bandwidth (κ above).
 GUARD_KAPPA = 1.0
+# Smallest |r·n| that a projection divides by.
+COS_MIN = 1e-3
 
 
 def kernel_axes(lobe: ASG, r, epsilon=0.02, rule="taylor"):
@@ -142,18 +144,20 @@ class PlaneKernel:
     """Elliptical Gaussian on a plane: exp(−(d·s)²/|s|⁴ − (d·t)²/|t|⁴) with s ⟂ t.
 
     s, t     orthogonal half axes, world units, |s| >= |t|.
-    bounded  the aspect cap or the grazing clamp acted on this lane.
+    clamped  the plane is seen edge-on: |r·n| < COS_MIN was raised to it.
+    capped   the aspect cap shortened the long axis.
     """
 
     s: Any
     t: Any
-    bounded: Any
+    clamped: Any
+    capped: Any
 
 
 def disc(n, radius) -> PlaneKernel:
     """The isotropic kernel of the same area: |s| = |t| = radius."""
     frame = mi.Frame3f(n)
-    return PlaneKernel(frame.s * radius, frame.t * radius, mi.Bool(False))
+    return PlaneKernel(frame.s * radius, frame.t * radius, mi.Bool(False), mi.Bool(False))
 
 
 def guarded_axes(
@@ -163,7 +167,7 @@ def guarded_axes(
 
     Ellipses are added and bounded as covariance matrices in an orthonormal basis of the plane, so
     that neither a degenerate parallelogram (s ∥ t) nor an edge-on plane needs a case of its own:
-    1/|r·n| is clamped at 1e3 and what the clamp or the cap max_aspect changed is reported.
+    |r·n| is clamped at COS_MIN, and where the clamp or the cap max_aspect acted is reported.
 
     lobe, r, n in one frame (world); distance, radius in world units. size="bandwidth" scales the
     ellipse to |s × t| = radius²; "epsilon" keeps the literal size of the rule.
@@ -188,8 +192,8 @@ def guarded_axes(
 
     # --- Projection along r, in the plane's basis ---
     cos_n = dr.dot(r, n)
-    grazing = dr.abs(cos_n) < 1e-3
-    inv = dr.mulsign(dr.rcp(dr.maximum(dr.abs(cos_n), 1e-3)), cos_n)
+    clamped = dr.abs(cos_n) < COS_MIN
+    inv = dr.mulsign(dr.rcp(dr.maximum(dr.abs(cos_n), COS_MIN)), cos_n)
     r1, r2 = dr.dot(r, frame.s), dr.dot(r, frame.t)
 
     def project(w):
@@ -222,4 +226,4 @@ def guarded_axes(
     long, short = mean * stretch, mean / stretch
     s = (frame.s * cos_t + frame.t * sin_t) * long
     t = (frame.t * cos_t - frame.s * sin_t) * short
-    return PlaneKernel(s, t, capped | grazing)
+    return PlaneKernel(s, t, clamped, capped)

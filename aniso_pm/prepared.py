@@ -95,14 +95,15 @@ class Prepared:
         options = density.KernelOptions(
             self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
         )
-        kernel, follows = density.kernels(points, radius, options)
+        kernel, follows, degenerate = density.kernels(points, radius, options)
         L, count = density.estimate(map_, points, kernel, radius, self.gather_depth, points.active)
         lost = mi.Bool(False)
         if s.edge_compensation:
             lit = points.active & (count > 0)
             inverse, lost = density.probe_surface(self.scene, sampler, points, kernel, radius, lit)
             L *= inverse
-        return density.Gathered(L, count, follows, follows & kernel.bounded, lost)
+        clamped, capped = follows & kernel.clamped, follows & kernel.capped
+        return density.Gathered(L, count, follows, clamped, capped, degenerate, lost)
 
 
 def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:

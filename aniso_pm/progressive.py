@@ -69,7 +69,9 @@ def render(scene: Prepared, sensor, seed: int, spp: int, report, statistics: dic
         "eye_samples_rejected": 0,
         "gather_points": 0,
         "gather_points_anisotropic": 0,
-        "gather_points_bounded": 0,
+        "gather_points_clamped": 0,
+        "gather_points_capped": 0,
+        "gather_points_degenerate": 0,
         "gather_points_off_surface": 0,
         "passes": 0,
         "spp": 0,
@@ -135,7 +137,9 @@ def _eye_pass(scene: Prepared, sensor, map_, radius, seed, index, spp, statistic
             L += gathered
             statistics["gather_points"] += dr.width(lanes)
             statistics["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
-            statistics["gather_points_bounded"] += int(dr.count(found.bounded)[0])
+            statistics["gather_points_clamped"] += int(dr.count(found.clamped)[0])
+            statistics["gather_points_capped"] += int(dr.count(found.capped)[0])
+            statistics["gather_points_degenerate"] += int(dr.count(found.degenerate)[0])
             statistics["gather_points_off_surface"] += int(dr.count(found.lost)[0])
             statistics["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
         clock.lap("gather")

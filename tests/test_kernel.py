@@ -523,7 +523,7 @@ def test_aspect_cap_shortens_the_long_axis_keeps_the_area_and_says_so():
     assert np.mean(aspect > 4) > 0.2
     np.testing.assert_allclose(held, np.minimum(aspect, 4), rtol=1e-3)
     clear = np.abs(aspect / 4 - 1) > 1e-3
-    np.testing.assert_array_equal(np.array(capped.bounded)[clear], (aspect > 4)[clear])
+    np.testing.assert_array_equal(np.array(capped.capped)[clear], (aspect > 4)[clear])
     np.testing.assert_allclose(
         np.linalg.norm(np.cross(arr(capped.s), arr(capped.t)), axis=-1), 1e-8, rtol=1e-5
     )
@@ -553,7 +553,7 @@ def test_guarded_kernel_is_finite_for_edge_on_planes_and_degenerate_lobes(rule, 
     s, t = arr(kernel.s), arr(kernel.t)
     assert np.all(np.isfinite(s)) and np.all(np.isfinite(t))
     assert np.all(np.linalg.norm(t, axis=-1) > 0)
-    assert np.all(np.array(kernel.bounded)[:4])
+    assert np.all(np.array(kernel.clamped)[:4])
     assert np.max(np.divide(*lengths(s, t))) < 32 * (1 + 1e-5)
 
 
