@@ -22,6 +22,7 @@ import mitsuba as mi
 from .asg import ASG
 from .ndf import asg_from_roughness, read_roughness
 from .needs import receiver_reflectance
+from .rays import largest_coordinate, spawn_ray
 from .warp import warp_to_reflection
 
 # Roughness ratio from which on a lobe counts as anisotropic.
@@ -81,6 +82,7 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
     """
     ctx = mi.BSDFContext()
     max_depth, rr_depth = dr.opaque(mi.UInt32, max_depth), dr.opaque(mi.UInt32, rr_depth)
+    reach = dr.opaque(mi.Float, largest_coordinate(scene))
 
     ray = mi.Ray3f(ray)  # Current ray
     depth = mi.UInt32(1)  # Path segments up to the vertex that is looked at
@@ -150,7 +152,7 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
         if dr.hint(follow_lobes, mode="scalar"):
             path = _follow(path, bsdf, si, ray, bs, active & ~gathered)
         valid |= on_surface & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        ray = si.spawn_ray(si.to_world(bs.wo))
+        ray = spawn_ray(si, si.to_world(bs.wo), reach)
         β *= weight
         η *= bs.eta
         si_prev = mi.Interaction3f(si)

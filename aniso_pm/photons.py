@@ -25,6 +25,7 @@ import mitsuba as mi
 
 from . import index as spatial
 from .needs import receiver_reflectance
+from .rays import largest_coordinate, spawn_ray
 
 # Light paths traced at once: bounds the memory of a wavefront, not the number of photons.
 WAVEFRONT = 1 << 21
@@ -153,6 +154,7 @@ def _trace_wavefront(
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
     capacity = dr.opaque(mi.UInt32, capacity)
     max_depth, rr_depth = dr.opaque(mi.UInt32, max_depth), dr.opaque(mi.UInt32, rr_depth)
+    reach = dr.opaque(mi.Float, largest_coordinate(scene))
 
     # --- Leave the emitter ---
     ray, emitted, _ = scene.sample_emitter_ray(
@@ -213,7 +215,7 @@ def _trace_wavefront(
         active &= ~roulette | (sampler.next_1d(active) < survive)
         β[roulette] = β * dr.rcp(survive)
 
-        ray = si.spawn_ray(wo)
+        ray = spawn_ray(si, wo, reach)
         depth += 1
 
 
