@@ -19,6 +19,8 @@ import mitsuba as mi
 
 from .asg import ASG
 
+# Smallest roughness of Mitsuba's microfacet distributions: bandwidths are at most 1e8.
+ALPHA_MIN = 1e-4
 _CURVATURE_FACTOR = {"beckmann": 1.0, "ggx": 2.0}
 
 
@@ -87,7 +89,8 @@ def roughness_source(bsdf):
     that returns (alpha_u, alpha_v), or None where the BSDF has no roughness that can be read.
 
     Wrappers (``twosided``, ``mask``, ``bumpmap``, ``normalmap``, ``blendbsdf``) are seen through
-    to the first nested BSDF that has a roughness, the back side of ``twosided`` apart.
+    to the first nested BSDF that has a roughness, the back side of ``twosided`` apart. Roughness is
+    at least 1e-4, as in Mitsuba's own distributions.
     """
     found = children(bsdf)
 
@@ -95,10 +98,13 @@ def roughness_source(bsdf):
         source = found[name]
         return source.eval_1(si, active) if isinstance(source, mi.Texture) else mi.Float(source)
 
+    def alpha(name, si, active):
+        return dr.maximum(value(name, si, active), ALPHA_MIN)
+
     if "alpha_u" in found and "alpha_v" in found:
-        return lambda si, active: (value("alpha_u", si, active), value("alpha_v", si, active))
+        return lambda si, active: (alpha("alpha_u", si, active), alpha("alpha_v", si, active))
     if "alpha" in found:
-        return lambda si, active: (value("alpha", si, active),) * 2
+        return lambda si, active: (alpha("alpha", si, active),) * 2
     if "roughness" in found and "spec_tint" in found or "anisotropic" in found:
         # Mitsuba's principled BSDFs, after Burley (2012).
         def principled(si, active):
