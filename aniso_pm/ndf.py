@@ -72,7 +72,8 @@ def children(bsdf) -> dict:
             self.found = {}
 
         def put(self, name, value, flags, cpptype=None):
-            self.found[name] = value
+            # Plain values come as pointers with the name of their type.
+            self.found[name] = mi.get_property(value, cpptype, bsdf) if cpptype else value
 
     collect = Collect()
     bsdf.traverse(collect)
