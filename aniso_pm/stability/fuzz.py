@@ -51,7 +51,8 @@ def _bsdf(dice: _Dice, depth: int = 0):
     alphas = {"alpha_u": dice.log(1e-5, 1), "alpha_v": dice.log(1e-5, 1)}
     simple = {
         "diffuse": {"type": "diffuse", "reflectance": dice.color()},
-        "metal": {"type": "roughconductor", "distribution": dice.one_of("beckmann", "ggx")} | alphas,
+        "metal": {"type": "roughconductor", "distribution": dice.one_of("beckmann", "ggx")}
+        | alphas,
         "asg": {"type": "asgconductor"} | alphas,
         "mirror": {"type": "conductor"},
         "glass": {"type": "dielectric", "int_ior": dice.between(1.01, 2.5)},
@@ -88,7 +89,9 @@ def _thing(dice: _Dice):
     T = mi.ScalarTransform4f
     axis = dice.rng.normal(size=3)
     axis = (axis / np.linalg.norm(axis)).tolist()
-    place = T().translate(dice.rng.uniform(-0.7, 0.7, 3).tolist()).rotate(axis, dice.between(0, 360))
+    place = (
+        T().translate(dice.rng.uniform(-0.7, 0.7, 3).tolist()).rotate(axis, dice.between(0, 360))
+    )
     kind = dice.one_of("sphere", "rectangle", "cube", "disk", "cylinder")
     size = [dice.log(1e-3, 0.6)] * 3
     if kind in ("rectangle", "cube") and dice.chance(0.5):
@@ -108,8 +111,17 @@ def _light(dice: _Dice):
     aim = T().look_at(origin=position, target=dice.rng.uniform(-1, 1, 3).tolist(), up=[0.1, 1, 0.3])
     return dice.one_of(
         {"type": "point", "position": position, "intensity": grey(power)},
-        {"type": "spot", "to_world": aim, "intensity": grey(power), "cutoff_angle": dice.between(1, 80)},
-        {"type": "directional", "direction": [0.1, -1, dice.between(-1, 1)], "irradiance": grey(power)},
+        {
+            "type": "spot",
+            "to_world": aim,
+            "intensity": grey(power),
+            "cutoff_angle": dice.between(1, 80),
+        },
+        {
+            "type": "directional",
+            "direction": [0.1, -1, dice.between(-1, 1)],
+            "irradiance": grey(power),
+        },
         {
             "type": "sphere",
             "center": position,
@@ -156,7 +168,9 @@ def render(seed: int) -> str | None:
     """What is wrong with that scene's picture, or None."""
     scene, integrator = random_scene(seed)
     try:
-        image = mi.render(mi.load_dict(scene), integrator=mi.load_dict(integrator), spp=4, seed=seed)
+        image = mi.render(
+            mi.load_dict(scene), integrator=mi.load_dict(integrator), spp=4, seed=seed
+        )
     except Exception as error:
         reason = one_line(error.__cause__ or error)
         # A scene that the integrator refuses with its own sentence is fine.
@@ -218,8 +232,14 @@ def _fuzz() -> Measured:
 
 def cases() -> list[Case]:
     return [
-        Case("fuzz", f"random scenes for {SECONDS:g} s", "crashes, hangs, pixels not finite", 0.0,
-             _fuzz, slow=True)
+        Case(
+            "fuzz",
+            f"random scenes for {SECONDS:g} s",
+            "crashes, hangs, pixels not finite",
+            0.0,
+            _fuzz,
+            slow=True,
+        )
     ]
 
 

@@ -39,9 +39,15 @@ def cases() -> list[Case]:
     # The rule "taylor", which is not the default, makes needles where the curvature along the lobe
     # vanishes: there the aspect cap is part of the answer.
     return [
-        Case(f"gallery, {name}", f"rule {rule}", "share of gather points with a fallback",
-             0.05 if rule == "taylor" else RARE, partial(_fallbacks, name, rule),
-             region="cap" if rule == "taylor" else None, slow=rule != "lobe")
+        Case(
+            f"gallery, {name}",
+            f"rule {rule}",
+            "share of gather points with a fallback",
+            0.05 if rule == "taylor" else RARE,
+            partial(_fallbacks, name, rule),
+            region="cap" if rule == "taylor" else None,
+            slow=rule != "lobe",
+        )
         for name in ("teapot", "fry_pan")
         for rule in RULES
     ]

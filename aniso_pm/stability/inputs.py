@@ -54,7 +54,11 @@ def _unclear(plugin, name, value, make, use) -> str | None:
         complaint = _complaint(lambda: made.append(use(made[0])))
     if complaint is None:
         return None if np.isfinite(made[1]).all() else f"{value!r} makes pixels that are not finite"
-    shown = {str(value), repr(value), f"{value:g}" if isinstance(value, (int, float)) else str(value)}
+    shown = {
+        str(value),
+        repr(value),
+        f"{value:g}" if isinstance(value, (int, float)) else str(value),
+    }
     missing = [word for word in (plugin, f'"{name}"') if word not in complaint]
     if not any(text in complaint for text in shown):
         missing.append("the value")
@@ -105,20 +109,32 @@ def _bsdf(name) -> Measured:
     if kind is float:
         spectrum = {"type": "uniform", "value": math.nan}
         refused = _complaint(partial(make, spectrum))
-        complaints.append(None if refused and f'"{name}"' in refused else "a spectrum of NaN passes")
+        complaints.append(
+            None if refused and f'"{name}"' in refused else "a spectrum of NaN passes"
+        )
     return _all_clear(complaints)
 
 
 def cases() -> list[Case]:
     quantity = "values neither refused clearly nor harmless"
     found = [
-        Case("wrong input", f"aniso_pm, {field.name}", quantity, 0.0,
-             partial(_integrator, field.name, type(field.default)))
+        Case(
+            "wrong input",
+            f"aniso_pm, {field.name}",
+            quantity,
+            0.0,
+            partial(_integrator, field.name, type(field.default)),
+        )
         for field in fields(Settings)
     ]
     found.append(
-        Case("wrong input", "aniso_pm, hide_emitters", quantity, 0.0,
-             partial(_integrator, "hide_emitters", bool))
+        Case(
+            "wrong input",
+            "aniso_pm, hide_emitters",
+            quantity,
+            0.0,
+            partial(_integrator, "hide_emitters", bool),
+        )
     )
     found += [
         Case("wrong input", f"asgconductor, {name}", quantity, 0.0, partial(_bsdf, name))

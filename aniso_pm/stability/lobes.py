@@ -38,7 +38,11 @@ EPSILON = 0.02
 
 def _views():
     degrees = np.pi / 180
-    at = lambda theta, phi: (np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta))  # noqa: E731
+    at = lambda theta, phi: (
+        np.sin(theta) * np.cos(phi),
+        np.sin(theta) * np.sin(phi),
+        np.cos(theta),
+    )  # noqa: E731
     return {
         "view at normal incidence": (0, 0, 1),
         "view 1e-7 rad off normal incidence": (1e-7, 0, 1),
@@ -141,9 +145,7 @@ def _isotropic(rule) -> Measured:
     before = [arr(w) for w in kernel_axes(asg(lobe), vec(r), EPSILON, rule)]
     lobe.x, lobe.y = lobe.y, -lobe.x
     after = [arr(w) for w in kernel_axes(asg(lobe), vec(r), EPSILON, rule)]
-    errors = [
-        ellipse_error([w[i] for w in after], [w[i] for w in before]) for i in range(len(r))
-    ]
+    errors = [ellipse_error([w[i] for w in after], [w[i] for w in before]) for i in range(len(r))]
     defined = _axes(rule, lobe, r)
     turned = Measured(*worst_of(errors, words(lobe)))
     return max(defined, turned, key=lambda m: m.worst)
@@ -177,9 +179,7 @@ def _isotropic_warp() -> Measured:
 
 def _largest_step(u, v) -> np.ndarray:
     """Relative change of the ellipse from each lane to the next."""
-    return np.array(
-        [ellipse_error([u[i + 1], v[i + 1]], [u[i], v[i]]) for i in range(len(u) - 1)]
-    )
+    return np.array([ellipse_error([u[i + 1], v[i + 1]], [u[i], v[i]]) for i in range(len(u) - 1)])
 
 
 def _continuity(alpha, sweep) -> Measured:
@@ -208,7 +208,8 @@ def _warp_continuity() -> Measured:
     o = np.stack([np.sin(theta) * 0.6, np.sin(theta) * 0.8, np.cos(theta)], -1)
     warped = warp_to_reflection(asg(ndf), vec(o))
     axes = [
-        arr(w) / np.sqrt(arr(b))[:, None] for w, b in ((warped.x, warped.lam), (warped.y, warped.mu))
+        arr(w) / np.sqrt(arr(b))[:, None]
+        for w, b in ((warped.x, warped.lam), (warped.y, warped.mu))
     ]
     steps = _largest_step(*axes)
     return Measured(*worst_of(steps, [f"θ {t:.3g}" for t in theta]))
@@ -280,7 +281,10 @@ def _log_value() -> Measured:
 def _samples() -> Measured:
     """Directions and densities of ``ASG.sample`` at the corners of the unit square."""
     lobe = lobes(np.repeat(roughnesses(), 4, 0))
-    u = np.tile([[0, 0], [0, 1 - 2**-24], [1 - 2**-24, 0], [1 - 2**-24, 1 - 2**-24]], (len(lobe.lam) // 4, 1))
+    u = np.tile(
+        [[0, 0], [0, 1 - 2**-24], [1 - 2**-24, 0], [1 - 2**-24, 1 - 2**-24]],
+        (len(lobe.lam) // 4, 1),
+    )
     v, pdf = asg(lobe).sample(mi.Point2f(flt(u[:, 0]), flt(u[:, 1])))
     off = np.abs(np.linalg.norm(arr(v), axis=1) - 1)
     fine = np.isfinite(arr(pdf)) & (arr(pdf) >= 0)
@@ -291,9 +295,7 @@ def _product() -> Measured:
     """Products of narrow lobes far apart: finite, unit frames, amplitude 0 at worst."""
     n = 400
     rng = np.random.default_rng(5)
-    factors = [
-        lobes(10.0 ** rng.uniform(-4, 0, (n, 2)), seed) for seed in (6, 7)
-    ]
+    factors = [lobes(10.0 ** rng.uniform(-4, 0, (n, 2)), seed) for seed in (6, 7)]
     found = factors[0], factors[1]
     p: ASG = __import__("aniso_pm").asg.product(asg(found[0]), asg(found[1]))
     off = np.max([np.abs(np.linalg.norm(arr(w), axis=1) - 1) for w in (p.x, p.y, p.z)], 0)
@@ -309,58 +311,123 @@ def cases() -> list[Case]:
         for name, o in _views().items()
     ]
     found.append(
-        Case("warp", "view below 1e-6 rad of grazing", "mass, relative", AXES, _warp_edge_on,
-             region="warp")
+        Case(
+            "warp",
+            "view below 1e-6 rad of grazing",
+            "mass, relative",
+            AXES,
+            _warp_edge_on,
+            region="warp",
+        )
     )
     found.append(
-        Case("warp", "isotropic roughness", "ellipse after turning the tangent, relative", AXES,
-             _isotropic_warp)
+        Case(
+            "warp",
+            "isotropic roughness",
+            "ellipse after turning the tangent, relative",
+            AXES,
+            _isotropic_warp,
+        )
     )
     found.append(
-        Case("warp", "from normal incidence to 89°", "largest change between neighbours", 0.05,
-             _warp_continuity)
+        Case(
+            "warp",
+            "from normal incidence to 89°",
+            "largest change between neighbours",
+            0.05,
+            _warp_continuity,
+        )
     )
     for rule in RULES:
         for place in _PLACES:
             if rule == "paper" and place == "r at the lobe's centre":
                 found.append(
-                    Case(f"lobe, {rule}", place, "second-order length, relative", AXES,
-                         _paper_at_centre, region="no gradient")
+                    Case(
+                        f"lobe, {rule}",
+                        place,
+                        "second-order length, relative",
+                        AXES,
+                        _paper_at_centre,
+                        region="no gradient",
+                    )
                 )
                 continue
             found.append(Case(f"lobe, {rule}", place, axes, AXES, partial(_axes_at, rule, place)))
         found += [
-            Case(f"lobe, {rule}", "bandwidth 1e10 (α 1e-5)", axes, AXES,
-                 partial(_bandwidth_1e10, rule)),
-            Case(f"lobe, {rule}", "isotropic: axes undefined", axes + ", and after a quarter turn",
-                 AXES, partial(_isotropic, rule)),
-            Case(f"lobe, {rule}", "r behind the lobe", "cosines between u, v, r", 1e-6,
-                 partial(_axes_behind, rule), region="behind"),
+            Case(
+                f"lobe, {rule}",
+                "bandwidth 1e10 (α 1e-5)",
+                axes,
+                AXES,
+                partial(_bandwidth_1e10, rule),
+            ),
+            Case(
+                f"lobe, {rule}",
+                "isotropic: axes undefined",
+                axes + ", and after a quarter turn",
+                AXES,
+                partial(_isotropic, rule),
+            ),
+            Case(
+                f"lobe, {rule}",
+                "r behind the lobe",
+                "cosines between u, v, r",
+                1e-6,
+                partial(_axes_behind, rule),
+                region="behind",
+            ),
         ]
     found += [
-        Case("Taylor lengths", f"gradient at {sigmas:g}σ", axes, AXES,
-             partial(_small_gradient, sigmas))
+        Case(
+            "Taylor lengths",
+            f"gradient at {sigmas:g}σ",
+            axes,
+            AXES,
+            partial(_small_gradient, sigmas),
+        )
         for sigmas in (1e-5, 1e-3, 0.03)
     ]
     found += [
-        Case("Taylor lengths", f"curvature through 0, ε {epsilon:g}, {words_} the zero", axes, AXES,
-             partial(_curvature_zero, epsilon, offset))
+        Case(
+            "Taylor lengths",
+            f"curvature through 0, ε {epsilon:g}, {words_} the zero",
+            axes,
+            AXES,
+            partial(_curvature_zero, epsilon, offset),
+        )
         for epsilon in (1e-8, 0.02, 10.0)
         for words_, offset in (("below", -1e-3), ("at", 0.0), ("above", 1e-3))
     ]
     found += [
-        Case("Taylor lengths", f"{rule}, ε {epsilon:g}", axes, AXES, partial(_epsilon, rule, epsilon))
+        Case(
+            "Taylor lengths", f"{rule}, ε {epsilon:g}", axes, AXES, partial(_epsilon, rule, epsilon)
+        )
         for rule in RULES
         for epsilon in (1e-8, 10.0)
     ]
     ratio = "largest step, quarter as wide over whole"
     found += [
-        Case("continuity", "through the centre, α 0.05/0.3", ratio, 0.4,
-             partial(_continuity, (0.05, 0.3), "centre")),
-        Case("continuity", "through the centre, α 0.1/0.1", ratio, 0.4,
-             partial(_continuity, (0.1, 0.1), "centre")),
-        Case("continuity", "through κ = 0, α 0.05/0.3", ratio, 0.4,
-             partial(_continuity, (0.05, 0.3), "curvature")),
+        Case(
+            "continuity",
+            "through the centre, α 0.05/0.3",
+            ratio,
+            0.4,
+            partial(_continuity, (0.05, 0.3), "centre"),
+        ),
+        Case(
+            "continuity",
+            "through the centre, α 0.1/0.1",
+            ratio,
+            0.4,
+            partial(_continuity, (0.1, 0.1), "centre"),
+        ),
+        Case(
+            "continuity",
+            "through κ = 0, α 0.05/0.3",
+            ratio,
+            0.4,
+            partial(_continuity, (0.05, 0.3), "curvature"),
+        ),
     ]
     found += [
         Case("lobe, value", "integral, bandwidths 1e-6 to 1e8", "relative", 1e-4, _integral),

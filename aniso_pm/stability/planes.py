@@ -146,7 +146,9 @@ def kernel_mass(s, t, n, radius) -> np.ndarray:
         on_plane = np.outer(a, s_) + np.outer(b, t_)
         on_plane -= np.outer(on_plane @ n_, n_)
         wide = lambda v: mi.Vector3f(*map(float, v))  # noqa: E731
-        e = Ellipses.from_axes(mi.Point3f(0), wide(s_), wide(t_), wide(n_), density.SLAB * float(radius_))
+        e = Ellipses.from_axes(
+            mi.Point3f(0), wide(s_), wide(t_), wide(n_), density.SLAB * float(radius_)
+        )
         d = vec(on_plane)
         rho2 = (arr(mi.Float(mi.Vector3f(e.a).x * d.x + e.a.y * d.y + e.a.z * d.z))) ** 2
         rho2 = rho2 + arr(e.b.x * d.x + e.b.y * d.y + e.b.z * d.z) ** 2
@@ -209,9 +211,7 @@ def _literal_coordinates(situation: Situation) -> Measured:
     in units of max(1, aspect/|r·n|)."""
     lanes = _lanes(situation)
     u, v = (f32(arr(w)) for w in kernel.kernel_axes(asg(lanes.lobe), vec(lanes.r), EPSILON, "lobe"))
-    s, t = kernel.project_to_plane(
-        vec(u), vec(v), vec(lanes.r), vec(lanes.n), flt(lanes.distance)
-    )
+    s, t = kernel.project_to_plane(vec(u), vec(v), vec(lanes.r), vec(lanes.n), flt(lanes.distance))
     d = _offsets(arr(s), arr(t))
     cosine = np.abs(np.sum(unit(lanes.r) * unit(lanes.n), -1))
     errors = []
@@ -240,9 +240,7 @@ def _literal_projection(situation: Situation) -> Measured:
     rounding of n alone changes r·n by 1e-7."""
     lanes = _lanes(situation)
     u, v = (f32(arr(w)) for w in kernel.kernel_axes(asg(lanes.lobe), vec(lanes.r), EPSILON, "lobe"))
-    s, t = kernel.project_to_plane(
-        vec(u), vec(v), vec(lanes.r), vec(lanes.n), flt(lanes.distance)
-    )
+    s, t = kernel.project_to_plane(vec(u), vec(v), vec(lanes.r), vec(lanes.n), flt(lanes.distance))
     errors = []
     for i in range(len(u)):
         exact = ref.mp_project(
@@ -310,24 +308,42 @@ def cases() -> list[Case]:
         for quantity, target, measure in quantities:
             found.append(
                 Case(
-                    "projection", name, quantity, target, partial(measure, situation),
+                    "projection",
+                    name,
+                    quantity,
+                    target,
+                    partial(measure, situation),
                     situation.region,
                 )
             )
         if situation.region and situation.size == "bandwidth":
             found.append(
                 Case(
-                    "projection", name, "area over radius², − 1", 1e-4,
-                    partial(_area, situation), situation.region,
+                    "projection",
+                    name,
+                    "area over radius², − 1",
+                    1e-4,
+                    partial(_area, situation),
+                    situation.region,
                 )
             )
     for cosine in (1.0, 0.1, 0.01, 1e-3, 1e-6, -0.5):
         situation = Situation(cosine=cosine)
         name = f"literal formulas, r·n = {cosine:g}"
         found += [
-            Case("projection", name, "s and t, relative, over max(1, 1/|r·n|)", 1e-6,
-                 partial(_literal_projection, situation)),
-            Case("projection", name, "coordinates over max(1, aspect/|r·n|)", 1e-6,
-                 partial(_literal_coordinates, situation)),
+            Case(
+                "projection",
+                name,
+                "s and t, relative, over max(1, 1/|r·n|)",
+                1e-6,
+                partial(_literal_projection, situation),
+            ),
+            Case(
+                "projection",
+                name,
+                "coordinates over max(1, aspect/|r·n|)",
+                1e-6,
+                partial(_literal_coordinates, situation),
+            ),
         ]
     return found

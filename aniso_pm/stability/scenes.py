@@ -238,10 +238,22 @@ def cases() -> list[Case]:
         ("translated by 1e3", 1.0, 1e3),
     ):
         found += [
-            Case("scale", f"room with plate, {words}", "energy, ours over ours at scale 1, − 1",
-                 0.01, partial(_against_itself, scale, offset), slow=True),
-            Case("scale", f"empty room, {words}", "energy over path's, beyond path's own movement",
-                 0.01, partial(_against_path_there, scale, offset), slow=True),
+            Case(
+                "scale",
+                f"room with plate, {words}",
+                "energy, ours over ours at scale 1, − 1",
+                0.01,
+                partial(_against_itself, scale, offset),
+                slow=True,
+            ),
+            Case(
+                "scale",
+                f"empty room, {words}",
+                "energy over path's, beyond path's own movement",
+                0.01,
+                partial(_against_path_there, scale, offset),
+                slow=True,
+            ),
         ]
     over_path = "energy over path's, − 1"
     for words, make in (
@@ -252,29 +264,66 @@ def cases() -> list[Case]:
         ("inverted normals: glass", partial(_inverted, "glass")),
         ("inverted normals: metal", partial(_inverted, "metal")),
     ):
-        found.append(Case("geometry", words, over_path, ENERGY, partial(_against_path, make), slow=True))
+        found.append(
+            Case("geometry", words, over_path, ENERGY, partial(_against_path, make), slow=True)
+        )
     T = mi.ScalarTransform4f
     down = T().look_at(origin=[0, 0.9, 0], target=[0.1, -1, 0], up=[0, 0, 1])
     for words, make in (
-        ("point light: no area", partial(_lit_by, {"type": "point", "position": [0, 0.8, 0], "intensity": grey(2.0)})),
-        ("spot light: no area", partial(_lit_by, {"type": "spot", "to_world": down, "intensity": grey(5.0)})),
+        (
+            "point light: no area",
+            partial(_lit_by, {"type": "point", "position": [0, 0.8, 0], "intensity": grey(2.0)}),
+        ),
+        (
+            "spot light: no area",
+            partial(_lit_by, {"type": "spot", "to_world": down, "intensity": grey(5.0)}),
+        ),
         ("light inside a closed box", _boxed_light),
         ("camera inside glass", _camera_in_glass),
     ):
-        found.append(Case("light", words, over_path, ENERGY, partial(_against_path, make), slow=True))
+        found.append(
+            Case("light", words, over_path, ENERGY, partial(_against_path, make), slow=True)
+        )
     found += [
         Case("light", "black walls: no photon stored", over_path, ENERGY, _nothing_stored),
-        Case("light", "black lamp", over_path, ENERGY,
-             partial(_against_path, partial(room, light=0.0), 4, 4)),
-        Case("light", "projector", "pixels that are not finite", 0.0,
-             partial(_finite_and_counted, _projector, "photons_rejected", 1_000_000), slow=True),
-        Case("light", "infinite radiance", "pixels that are not finite", 0.0,
-             partial(_finite_and_counted, _infinite_light, "photons_rejected"), region="dropped"),
+        Case(
+            "light",
+            "black lamp",
+            over_path,
+            ENERGY,
+            partial(_against_path, partial(room, light=0.0), 4, 4),
+        ),
+        Case(
+            "light",
+            "projector",
+            "pixels that are not finite",
+            0.0,
+            partial(_finite_and_counted, _projector, "photons_rejected", 1_000_000),
+            slow=True,
+        ),
+        Case(
+            "light",
+            "infinite radiance",
+            "pixels that are not finite",
+            0.0,
+            partial(_finite_and_counted, _infinite_light, "photons_rejected"),
+            region="dropped",
+        ),
         Case("film", "1 × 1", over_path, ENERGY, partial(_film, 1, 1), slow=True),
         Case("film", "8192 × 64", over_path, ENERGY, partial(_film, 8192, 64), slow=True),
-        Case("wavefronts", "20 of photons", "energy over one wavefront's, − 1", 0.01,
-             partial(_many_wavefronts, 2500, 1 << 21)),
-        Case("wavefronts", "20 of eye samples", "energy over one wavefront's, − 1", 0.01,
-             partial(_many_wavefronts, 1 << 21, 2 * 24 * 24)),
+        Case(
+            "wavefronts",
+            "20 of photons",
+            "energy over one wavefront's, − 1",
+            0.01,
+            partial(_many_wavefronts, 2500, 1 << 21),
+        ),
+        Case(
+            "wavefronts",
+            "20 of eye samples",
+            "energy over one wavefront's, − 1",
+            0.01,
+            partial(_many_wavefronts, 1 << 21, 2 * 24 * 24),
+        ),
     ]
     return found

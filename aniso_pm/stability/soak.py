@@ -65,11 +65,19 @@ def _memory() -> Measured:
     words = f"{RENDERS} renders, a change of variant every {EVERY}: {grown:+.1f} MiB, "
     # Pictures differ by the order of sums alone.
     same = worst < 1e-3
-    return Measured(max(grown, 0.0) if same else float("nan"), f"{words}pictures within {worst:.1g}")
+    return Measured(
+        max(grown, 0.0) if same else float("nan"), f"{words}pictures within {worst:.1g}"
+    )
 
 
 def cases() -> list[Case]:
     return [
-        Case("soak", f"{RENDERS} renders with changes of variant", "growth of memory, MiB", 20.0,
-             _memory, slow=True)
+        Case(
+            "soak",
+            f"{RENDERS} renders with changes of variant",
+            "growth of memory, MiB",
+            20.0,
+            _memory,
+            slow=True,
+        )
     ]

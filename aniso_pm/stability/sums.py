@@ -158,7 +158,11 @@ def _visits(position, at, radius) -> float:
         return total[0] + 1, total[1] + dr.select(inside, mi.UInt32(1), 0)
 
     tested, found = spatial.gather(
-        index, ellipses, density.CUT2, visit, (mi.UInt32(0), mi.UInt32(0)),
+        index,
+        ellipses,
+        density.CUT2,
+        visit,
+        (mi.UInt32(0), mi.UInt32(0)),
         dr.full(mi.Bool, True, len(at)),
     )
     return float(np.array(tested, float).sum() / np.array(found, float).sum())
@@ -182,21 +186,43 @@ def _coin_in_a_stadium() -> Measured:
 def cases() -> list[Case]:
     group, relative = "density estimation", "irradiance, relative"
     return [
-        Case(group, "one photon, exactly at the gather point", relative, SUMS,
-             partial(_at_the_point, 1)),
+        Case(
+            group,
+            "one photon, exactly at the gather point",
+            relative,
+            SUMS,
+            partial(_at_the_point, 1),
+        ),
         Case(group, "1,000 coincident photons", relative, SUMS, partial(_at_the_point, 1000)),
         Case(group, "100,000 coincident photons", relative, SUMS, partial(_at_the_point, 100_000)),
-        Case(group, "1e6 equal photons in a kernel", relative, SUMS,
-             partial(_one_kernel, 1_000_000, "equal")),
-        Case(group, "1e6 photons of 1e-6 to 1e6 W in a kernel", relative, SUMS,
-             partial(_one_kernel, 1_000_000, "spread")),
+        Case(
+            group,
+            "1e6 equal photons in a kernel",
+            relative,
+            SUMS,
+            partial(_one_kernel, 1_000_000, "equal"),
+        ),
+        Case(
+            group,
+            "1e6 photons of 1e-6 to 1e6 W in a kernel",
+            relative,
+            SUMS,
+            partial(_one_kernel, 1_000_000, "spread"),
+        ),
         Case(group, "heaps of 1e-20 to 1e20 W in a map", relative, SUMS, _powers_apart),
         Case(group, "1e-20 to 1e20 W in a kernel", relative, SUMS, _powers_together),
-        Case(group, "photons 1e3 from the origin", relative, SUMS,
-             partial(_far_from_the_origin, 1e3)),
-        Case(group, "photons 1e6 from the origin", relative, SUMS,
-             partial(_far_from_the_origin, 1e6)),
+        Case(
+            group, "photons 1e3 from the origin", relative, SUMS, partial(_far_from_the_origin, 1e3)
+        ),
+        Case(
+            group, "photons 1e6 from the origin", relative, SUMS, partial(_far_from_the_origin, 1e6)
+        ),
         Case(group, "3e7 photons", relative, SUMS, _thirty_million, slow=True),
-        Case(group, "a coin in a stadium", "photons tested, over those of the coin alone", 1.5,
-             _coin_in_a_stadium),
+        Case(
+            group,
+            "a coin in a stadium",
+            "photons tested, over those of the coin alone",
+            1.5,
+            _coin_in_a_stadium,
+        ),
     ]

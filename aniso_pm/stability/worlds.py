@@ -77,7 +77,9 @@ def room(extra=None, place=None, size=24, light=8.0, albedo=0.6, without=()):
             "near_clip": 1e-4 * place.scale,
             "far_clip": 1e4 * place.scale,
             # Scaling a sensor is refused: only its origin moves.
-            "to_world": T().translate(place.point(0, 0, 0.97)) @ T().translate([0, 0, -0.97]) @ camera,
+            "to_world": T().translate(place.point(0, 0, 0.97))
+            @ T().translate([0, 0, -0.97])
+            @ camera,
             "film": film(size, size),
             "sampler": {"type": "independent"},
         },
