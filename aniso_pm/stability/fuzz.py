@@ -1,6 +1,7 @@
 """Random scenes: no crash, no hang, no pixel that is not finite; the seed says which scene.
 
-Scenes are rendered in a process of their own, so that a crash or a hang is a finding like any other.
+Scenes are rendered in a process of their own, so that a crash or a hang is a finding like any
+other.
 ``python -m aniso_pm.stability.fuzz SEED SECONDS`` renders one scene after the other and prints the
 seed of each; ``python -m aniso_pm.stability.fuzz SEED 0`` renders that one.
 """

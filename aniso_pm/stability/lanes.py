@@ -94,9 +94,9 @@ def ellipse_error(found, wanted) -> float:
     """Error of the ellipse with half axes ``found`` (two float vectors) against ``wanted`` (two
     orthogonal mpmath or float vectors).
 
-    The largest relative error of a length in any direction: |σ − 1| for the singular values σ of the
-    map that takes the one ellipse, seen in coordinates in which the other is a circle, to a circle;
-    the short axis counts as much as the long one. A single-precision vector holds a direction to
+    The largest relative error of a length in any direction: |σ − 1| for the singular values σ of
+    the found half axes in coordinates in which the wanted ellipse is the unit circle; the short
+    axis counts as much as the long one. A single-precision vector holds a direction to
     1e-7, by which the long axis of an ellipse of aspect A moves the short one by 1e-7·A: above an
     aspect of 1e4 the error is divided by A/1e4.
     """

@@ -136,8 +136,10 @@ def quadrature(nodes: int = 24, angles: int = 48):
 
 
 def kernel_mass(s, t, n, radius) -> np.ndarray:
-    """∫ of the normalised kernel over its plane as the gather weighs photons: Σ w / (π |s| |t| (1 − e⁻⁴))
-    over quadrature nodes on the exact plane, each weighed by the library. s, t, n: (count, 3)."""
+    """∫ of the normalised kernel over its plane, as the gather weighs photons.
+
+    Σ w / (π |s| |t| (1 − e⁻⁴)) over quadrature nodes on the exact plane, each weighed by the
+    library. s, t, n: (count, 3)."""
     a, b, weight = quadrature()
     count = len(a)
     n = unit(n)

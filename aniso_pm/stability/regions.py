@@ -23,7 +23,8 @@ class Region:
 REGIONS = (
     Region(
         "cap",
-        "half axes of the projected ellipse, the guard's disc added, differ by more than max_aspect",
+        "half axes of the projected ellipse, the guard's disc added, differ by more than "
+        "max_aspect",
         "the long axis is shortened and the short one lengthened to that ratio; the area stays",
         "gather_points_capped",
     ),
@@ -42,7 +43,8 @@ REGIONS = (
     ),
     Region(
         "no gradient",
-        'rule "paper" where |∇ ln G| < 1e-14 (2 max(λ, μ) + 1): the printed length ε/|g| is infinite',
+        'rule "paper" where |∇ ln G| < 1e-14 (2 max(λ, μ) + 1): the printed length ε/|g| is '
+        "infinite",
         "that length at the floor, along the steeper axis of the Hessian; the aspect cap then acts",
         "gather_points_capped",
     ),

@@ -15,7 +15,6 @@ import mitsuba as mi
 import numpy as np
 from aniso_pm import photons, progressive
 
-from . import worlds
 from .case import Case, Measured
 from .worlds import Place, ball, diffuse, film, grey, mesh, plate, room
 
@@ -79,7 +78,8 @@ def _against_path_there(scale, offset) -> Measured:
         for how in (("aniso_pm", 64), ("path", 512))
     )
     distance, moved = abs(ours / path - ours_1 / path_1), abs(path / path_1 - 1)
-    words = f"ours/path {ours / path:.4f} here, {ours_1 / path_1:.4f} at scale 1; path/path {path / path_1:.4f}"
+    words = f"ours/path {ours / path:.4f} here, {ours_1 / path_1:.4f} at scale 1"
+    words += f"; path/path {path / path_1:.4f}"
     return Measured(max(distance - moved, 0.0), words)
 
 
