@@ -1,7 +1,7 @@
 """Numerical stability, shown: extreme cases, each with its worst error and its verdict.
 
 ``aniso-pm stability`` runs them and writes the table; the tests run the same list. A module of
-cases is one idea (lobes, planes, sums, scenes, inputs, gallery, fuzz, soak) and has a function
+cases is one idea (lobes, bsdfs, planes, sums, scenes, inputs, gallery, fuzz, soak) and has a function
 ``cases()``; ``case`` says what a case is, ``reference`` holds the 50-digit definitions, ``regions``
 the fallbacks, ``page`` makes the table. Needs the packages of the extra ``aniso-pm[stability]``.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-GROUPS = ("lobes", "planes", "sums", "scenes", "gallery", "inputs", "fuzz", "soak")
+GROUPS = ("lobes", "bsdfs", "planes", "sums", "scenes", "gallery", "inputs", "fuzz", "soak")
 
 
 def all_cases() -> list:
