@@ -108,3 +108,8 @@ def ellipse_error(found, wanted) -> float:
     aspect = max(norms) / min(norms)
     stretch = np.linalg.svd(inside, compute_uv=False)
     return float(np.abs(stretch - 1).max()) / max(1.0, aspect / 1e4)
+
+
+def largest_steps(u, v) -> np.ndarray:
+    """Relative change of the ellipse from each lane to the next."""
+    return np.array([ellipse_error([u[i + 1], v[i + 1]], [u[i], v[i]]) for i in range(len(u) - 1)])

@@ -1,14 +1,16 @@
-"""Cases about lobes: the warp, the kernel's axes, continuity."""
+"""Cases about lobes: the kernel's axes, their lengths, continuity, values."""
 
 from __future__ import annotations
 
 from functools import partial
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+from aniso_pm import density
 from aniso_pm.asg import product
-from aniso_pm.kernel import RULES, kernel_axes
-from aniso_pm.warp import warp_to_reflection
+from aniso_pm.eye import GatherPoints, LobeOnPath
+from aniso_pm.kernel import RULES, guarded_axes, kernel_axes
 
 from . import reference as ref
 from .case import Case, Measured, worst_of
@@ -17,8 +19,8 @@ from .lanes import (
     asg,
     at_height,
     ellipse_error,
-    f32,
     flt,
+    largest_steps,
     lobes,
     off_by_sigmas,
     off_centre,
@@ -31,56 +33,6 @@ from .lanes import (
 # Asked for: kernel axes within 1e-3 of the definition. Squared lengths: twice that.
 AXES = 1e-3
 EPSILON = 0.02
-
-# --- The warp ------------------------------------------------------------------------------------
-
-
-def _view(theta, phi):
-    """The direction at θ degrees from the normal, φ degrees from the tangent."""
-    theta, phi = np.radians(theta), np.radians(phi)
-    return np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
-
-
-_VIEWS = {
-    "view at normal incidence": (0, 0, 1),
-    "view 1e-7 rad off normal incidence": (1e-7, 0, 1),
-    "view 1e-4 rad off normal incidence": (6e-5, 8e-5, 1),
-    "view at 60°": _view(60, 40),
-    "view at 60° along the tangent": (3**0.5 / 2, 0, 0.5),
-    "view at 60° along the bitangent": (0, 3**0.5 / 2, 0.5),
-    "view at 89.99°": _view(89.99, 40),
-    "view at 89.99° along the tangent": (1, 0, 1.745e-4),
-    "view at 89.99° along the bitangent": (0, 1, 1.745e-4),
-}
-
-
-def _warp(o) -> Measured:
-    ndf = lobes(roughnesses(), local=True)
-    o = np.broadcast_to(f32(unit(np.array(o, float))), ndf.x.shape)
-    warped = warp_to_reflection(asg(ndf), vec(o))
-    x, y, lam, mu = (arr(a) for a in (warped.x, warped.y, warped.lam, warped.mu))
-    errors = []
-    for i in range(len(lam)):
-        axes, mirror = ref.mp_warped_axes(ndf, i, o[i])
-        error = ellipse_error([x[i] / lam[i] ** 0.5, y[i] / mu[i] ** 0.5], axes)
-        # The centre in standard deviations of the narrower axis.
-        off = np.linalg.norm(arr(warped.z)[i] - ref.floats(mirror)) * lam[i] ** 0.5
-        errors.append(max(error, 1e-3 * off))
-    return Measured(*worst_of(errors, words(ndf)))
-
-
-def _warp_edge_on() -> Measured:
-    """Views below the smallest cosine: finite, and the mass of the clamped angle."""
-    ndf = lobes(roughnesses(), local=True)
-    o = np.broadcast_to(f32(unit(np.array([1, 1, 1e-8]))), ndf.x.shape)
-    warped = warp_to_reflection(asg(ndf), vec(o))
-    # λ'μ' = λμ/(16 c²) with c = 1e-6.
-    mass = np.sqrt(arr(warped.lam)) * np.sqrt(arr(warped.mu))
-    wanted = np.sqrt(ndf.lam) * np.sqrt(ndf.mu) / 4e-6
-    errors = np.abs(mass / wanted - 1)
-    finite = np.isfinite(arr(warped.x)).all(1) & np.isfinite(arr(warped.y)).all(1)
-    return Measured(*worst_of(np.where(finite, errors, np.nan), words(ndf)), fallback=1.0)
-
 
 # --- The kernel's axes ---------------------------------------------------------------------------
 
@@ -119,19 +71,43 @@ def _paper_at_centre() -> Measured:
     small = np.minimum(lobe.lam, lobe.mu)
     errors = np.abs(np.linalg.norm(v, axis=1) * (2 * small + 1) / (2 * EPSILON) - 1)
     fine = np.isfinite(u).all(1) & (np.linalg.norm(u, axis=1) > 0)
-    return Measured(*worst_of(np.where(fine, errors, np.nan), words(lobe)), fallback=1.0)
+    kernel = guarded_axes(
+        asg(lobe), vec(lobe.z), vec(lobe.z), 1.0, 0.01, EPSILON, "paper", guard=False
+    )
+    capped = float(np.mean(np.array(kernel.capped)))
+    return Measured(*worst_of(np.where(fine, errors, np.nan), words(lobe)), capped)
 
 
-def _axes_behind(rule) -> Measured:
-    """Behind the lobe: finite, positive, orthogonal tangents, whatever their length."""
+def _behind():
     lobe = lobes(roughnesses())
     r = at_height(lobe, -0.3)
     r[::3] = -lobe.z[::3]
+    return lobe, r
+
+
+def _axes_behind(rule) -> Measured:
+    """Behind the lobe the literal axes are finite, orthogonal tangents of whatever length."""
+    lobe, r = _behind()
     u, v = (arr(w) for w in kernel_axes(asg(lobe), vec(r), EPSILON, rule))
     fine = np.isfinite(u).all(1) & np.isfinite(v).all(1)
     fine &= (np.linalg.norm(u, axis=1) > 0) & (np.linalg.norm(v, axis=1) > 0)
     tilt = np.max([np.abs(np.sum(unit(p) * unit(q), -1)) for p, q in ((u, v), (u, r), (v, r))], 0)
-    return Measured(*worst_of(np.where(fine, tilt, np.nan), words(lobe)), fallback=1.0)
+    return Measured(*worst_of(np.where(fine, tilt, np.nan), words(lobe)))
+
+
+def _kernel_behind(rule) -> Measured:
+    """Behind the lobe the integrator takes the disc, and says so."""
+    lobe, r = _behind()
+    count = len(r)
+    path = LobeOnPath(asg(lobe), vec(r), mi.Float(2), dr.full(mi.Bool, True, count))
+    points = GatherPoints(
+        path.valid, mi.Point3f(0), mi.Normal3f(vec(-r)), mi.Spectrum(1), mi.UInt32(2), path
+    )
+    options = density.KernelOptions(True, rule, "bandwidth", EPSILON, True, 32.0)
+    kernel, _, degenerate = density.kernels(points, mi.Float(0.1), options)
+    lengths = [np.linalg.norm(arr(w), axis=1) for w in (kernel.s, kernel.t)]
+    errors = np.max(np.abs(np.array(lengths) / 0.1 - 1), 0)
+    return Measured(*worst_of(errors, words(lobe)), float(np.mean(np.array(degenerate))))
 
 
 def _isotropic(rule) -> Measured:
@@ -149,35 +125,7 @@ def _isotropic(rule) -> Measured:
     return max(defined, turned, key=lambda m: m.worst)
 
 
-def _isotropic_warp() -> Measured:
-    """λ = μ: the warped lobe does not depend on the tangent that the surface happens to have."""
-    alpha = np.repeat(roughnesses(aspects=(1.0,)), 12, 0)
-    ndf = lobes(alpha, local=True)
-    rng = np.random.default_rng(4)
-    o = rng.normal(size=ndf.z.shape)
-    o[:, 2] = np.abs(o[:, 2]) + 1e-3
-    o = f32(unit(o))
-    angle = rng.uniform(0, 2 * np.pi, len(alpha))
-    turned = lobes(alpha, local=True)
-    turned.x = f32(np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1))
-    turned.y = f32(np.stack([-np.sin(angle), np.cos(angle), 0 * angle], -1))
-    axes = []
-    for lobe in (ndf, turned):
-        warped = warp_to_reflection(asg(lobe), vec(o))
-        scale = [1 / np.sqrt(arr(w))[:, None] for w in (warped.lam, warped.mu)]
-        axes.append([arr(warped.x) * scale[0], arr(warped.y) * scale[1]])
-    errors = [
-        ellipse_error([w[i] for w in axes[1]], [w[i] for w in axes[0]]) for i in range(len(alpha))
-    ]
-    return Measured(*worst_of(errors, words(ndf)))
-
-
 # --- Continuity: neighbours along a path through everything ---------------------------------------
-
-
-def _largest_step(u, v) -> np.ndarray:
-    """Relative change of the ellipse from each lane to the next."""
-    return np.array([ellipse_error([u[i + 1], v[i + 1]], [u[i], v[i]]) for i in range(len(u) - 1)])
 
 
 def _continuity(alpha, sweep) -> Measured:
@@ -191,26 +139,11 @@ def _continuity(alpha, sweep) -> Measured:
             r = off_by_sigmas(lobe, 0.7 * t, 0.7 * t)
         else:  # from the centre out to 4σ: through the zero of κ along the long axis
             r = off_by_sigmas(lobe, 2 + 2 * t, 0.3 + 0 * t)
-        return np.max(_largest_step(*(arr(w) for w in kernel_axes(asg(lobe), vec(r)))))
+        return np.max(largest_steps(*(arr(w) for w in kernel_axes(asg(lobe), vec(r)))))
 
     coarse, fine = steps(1001), steps(4001)
     # A quarter if the ellipse is continuous with a bounded slope, 1 if it jumps.
     return Measured(float(fine / max(coarse, 1e-30)), f"largest step {fine:.2g} of the ellipse")
-
-
-def _warp_continuity() -> Measured:
-    """From normal incidence to 89°, through the take-over of the tangent at 1e-4 rad."""
-    grazing = np.pi / 2 - np.geomspace(0.6, 0.017, 2000)
-    theta = np.concatenate([np.geomspace(1e-6, 1e-3, 2000), np.linspace(1e-3, 0.97, 2000), grazing])
-    ndf = lobes(np.repeat([(0.02, 0.3)], len(theta), 0), local=True)
-    o = np.stack([np.sin(theta) * 0.6, np.sin(theta) * 0.8, np.cos(theta)], -1)
-    warped = warp_to_reflection(asg(ndf), vec(o))
-    axes = [
-        arr(w) / np.sqrt(arr(b))[:, None]
-        for w, b in ((warped.x, warped.lam), (warped.y, warped.mu))
-    ]
-    steps = _largest_step(*axes)
-    return Measured(*worst_of(steps, [f"θ {t:.3g}" for t in theta]))
 
 
 # --- Taylor lengths ------------------------------------------------------------------------------
@@ -302,38 +235,7 @@ def _product() -> Measured:
 
 def cases() -> list[Case]:
     axes = "ellipse of the kernel axes, relative"
-    found = [
-        Case("warp", name, "warped ellipse, relative", AXES, partial(_warp, o))
-        for name, o in _VIEWS.items()
-    ]
-    found.append(
-        Case(
-            "warp",
-            "view below 1e-6 rad of grazing",
-            "mass, relative",
-            AXES,
-            _warp_edge_on,
-            region="warp",
-        )
-    )
-    found.append(
-        Case(
-            "warp",
-            "isotropic roughness",
-            "ellipse after turning the tangent, relative",
-            AXES,
-            _isotropic_warp,
-        )
-    )
-    found.append(
-        Case(
-            "warp",
-            "from normal incidence to 89°",
-            "largest change between neighbours",
-            0.05,
-            _warp_continuity,
-        )
-    )
+    found = []
     for rule in RULES:
         for place in _PLACES:
             if rule == "paper" and place == "r at the lobe's centre":
@@ -370,6 +272,13 @@ def cases() -> list[Case]:
                 "cosines between u, v, r",
                 1e-6,
                 partial(_axes_behind, rule),
+            ),
+            Case(
+                f"lobe, {rule}",
+                "r behind the lobe",
+                "half axes over the radius, − 1",
+                1e-6,
+                partial(_kernel_behind, rule),
                 region="behind",
             ),
         ]

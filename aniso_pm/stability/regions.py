@@ -1,7 +1,7 @@
 """Fallbacks: what is done where the exact answer does not exist or cannot be represented.
 
-Written down before anything is measured. A case lies in a region, and then its answer is a fallback
-that was counted, or outside of all of them, and then none may act.
+None of these limits was fitted to the table. A case lies in a region, and then its answer is a
+fallback that was counted, or outside of all of them, and then none may act.
 """
 
 from __future__ import annotations
