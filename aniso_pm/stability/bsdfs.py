@@ -14,6 +14,21 @@ from .lanes import roughnesses
 _SAMPLES = 1 << 15
 
 
+def sampled(bsdf, cosine, count):
+    """(weight, value, pdf of sample(), pdf of eval_pdf()) of ``count`` sampled directions at a
+    view of that cosine."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, count)
+    sine = (1 - cosine**2) ** 0.5
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = mi.Vector3f(0.8 * sine, 0.6 * sine, cosine)
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    context = mi.BSDFContext()
+    bs, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d())
+    value, pdf = bsdf.eval_pdf(context, si, bs.wo)
+    return [np.array(a) for a in (weight, value, bs.pdf, pdf)]
+
+
 def _energy(cosine) -> Measured:
     """What a perfect mirror's facets reflect beyond what arrives: mean of the sampling weights, −1
     where that is positive. Not a number where a weight, a value or a density is not finite."""
@@ -29,16 +44,7 @@ def _energy(cosine) -> Measured:
                 "alpha_v": float(alpha_v),
             }
         )
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(0, _SAMPLES)
-        sine = (1 - cosine**2) ** 0.5
-        si = dr.zeros(mi.SurfaceInteraction3f, _SAMPLES)
-        si.wi = mi.Vector3f(0.8 * sine, 0.6 * sine, cosine)
-        si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
-        context = mi.BSDFContext()
-        bs, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d())
-        value, pdf = bsdf.eval_pdf(context, si, bs.wo)
-        numbers = [np.array(a) for a in (weight[0], value[0], pdf, bs.pdf)]
+        numbers = sampled(bsdf, cosine, _SAMPLES)
         finite = all(np.isfinite(a).all() for a in numbers)
         excess.append(max(numbers[0].mean() - 1, 0.0) if finite else np.nan)
     return Measured(*worst_of(excess, [f"α {u:g}, {v:g}" for u, v in alpha]))

@@ -16,8 +16,9 @@ from aniso_pm.errors import one_line
 from aniso_pm.plugins import asgconductor
 from aniso_pm.settings import Settings
 
+from .bsdfs import sampled
 from .case import Case, Measured
-from .worlds import Place, plate, room
+from .worlds import plate, room
 
 _NUMBERS = (math.nan, math.inf, -math.inf, -1.0, 0.0, 1e30, -1e30, 1e-30)
 WRONG = {
@@ -46,14 +47,14 @@ def _complaint(action) -> str | None:
 def _unclear(plugin, name, value, make, use) -> str | None:
     """What is wrong with the way in which ``value`` was received; None if nothing is.
 
-    Refused: the line names plugin, parameter, value and what it must be. Accepted: the picture is
-    finite."""
+    Refused: the line names plugin, parameter, value and what it must be. Accepted: what ``use``
+    makes of it (a picture, samples) is finite."""
     made = []
     complaint = _complaint(lambda: made.append(make()))
     if complaint is None:
         complaint = _complaint(lambda: made.append(use(made[0])))
     if complaint is None:
-        return None if np.isfinite(made[1]).all() else f"{value!r} makes pixels that are not finite"
+        return None if np.isfinite(made[1]).all() else f"{value!r} makes values that are not finite"
     shown = {
         str(value),
         repr(value),
@@ -95,12 +96,10 @@ def _bsdf(name) -> Measured:
         bsdf = {"type": "asgconductor", name: value}
         if other:
             bsdf[other] = 0.5
-        mi.load_dict(bsdf)
-        return mi.load_dict(room(lambda p: {"plate": plate(Place(), bsdf)}, size=4))
+        return mi.load_dict(bsdf)
 
-    def use(scene):
-        integrator = mi.load_dict({"type": "aniso_pm", "photon_count": 1000})
-        return np.array(mi.render(scene, integrator=integrator, spp=1))
+    def use(bsdf):
+        return np.concatenate([a.ravel() for a in sampled(bsdf, 0.5, 1000)])
 
     values = list(WRONG[kind])
     if name in asgconductor.RANGES:
