@@ -28,6 +28,8 @@ from .lanes import (
 )
 
 EPSILON = 0.02
+# |r·n| below which the region "clamp" begins.
+COS_MIN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def _lanes(situation: Situation) -> Lanes:
     c = situation.cosine
     n = f32(unit(c * exact + np.sqrt(1 - c * c) * e))
     distance = np.full(count, f32(situation.distance))
-    footprint = situation.distance * 0.1 / np.sqrt(max(abs(c), kernel.COS_MIN))
+    footprint = situation.distance * 0.1 / np.sqrt(max(abs(c), COS_MIN))
     return Lanes(lobe, r, n, distance, np.full(count, f32(situation.radius * footprint)))
 
 
@@ -91,9 +93,11 @@ def _kernel(s: Situation, lanes: Lanes):
     )
 
 
-def _fallback(found, count) -> float:
-    acted = np.broadcast_to(np.array(found.clamped) | np.array(found.capped), count)
-    return float(acted.mean())
+def _fallback(situation, found, count) -> float:
+    """Share of lanes in which the situation's fallback acted; any, where none is to act."""
+    clamped, capped = np.array(found.clamped), np.array(found.capped)
+    acted = {"clamp": clamped, "cap": capped, None: clamped | capped}[situation.region]
+    return float(np.broadcast_to(acted, count).mean())
 
 
 def _shape(situation: Situation) -> Measured:
@@ -115,10 +119,10 @@ def _shape(situation: Situation) -> Measured:
             situation.guard,
             situation.max_aspect,
             situation.size,
-            kernel.COS_MIN,
+            COS_MIN,
         )
         errors.append(ellipse_error([s[i], t[i]], wanted))
-    return Measured(*worst_of(errors, words(lanes.lobe)), _fallback(found, len(s)))
+    return Measured(*worst_of(errors, words(lanes.lobe)), _fallback(situation, found, len(s)))
 
 
 def quadrature(nodes: int = 24, angles: int = 48):
@@ -168,7 +172,7 @@ def _mass(situation: Situation) -> Measured:
     s, t = arr(found.s), arr(found.t)
     mass = kernel_mass(s, t, lanes.n, lanes.radius)
     return Measured(
-        *worst_of(np.abs(mass - 1), words(lanes.lobe)), fallback=_fallback(found, len(s))
+        *worst_of(np.abs(mass - 1), words(lanes.lobe)), fallback=_fallback(situation, found, len(s))
     )
 
 
@@ -178,7 +182,7 @@ def _area(situation: Situation) -> Measured:
     found = _kernel(situation, lanes)
     area = np.linalg.norm(np.cross(arr(found.s), arr(found.t)), axis=1)
     errors = np.abs(area / lanes.radius**2 - 1)
-    return Measured(*worst_of(errors, words(lanes.lobe)), _fallback(found, len(area)))
+    return Measured(*worst_of(errors, words(lanes.lobe)), _fallback(situation, found, len(area)))
 
 
 def _offsets(s, t):
@@ -203,9 +207,9 @@ def _coordinates(situation: Situation) -> Measured:
         aspect = np.linalg.norm(s[i]) / np.linalg.norm(t[i])
         wide = [mi.Vector3f(*map(float, c[i])) for c in covectors]
         a, b = (arr(c.x * p.x + c.y * p.y + c.z * p.z) for c in wide for p in (vec(d[i]),))
-        sure = max(1.0, aspect / max(cosine[i], kernel.COS_MIN))
+        sure = max(1.0, aspect / max(cosine[i], COS_MIN))
         errors.append(_against_solution(a, b, d[i], s[i], t[i], lanes.n[i]) / sure)
-    return Measured(*worst_of(errors, words(lanes.lobe)), _fallback(found, len(s)))
+    return Measured(*worst_of(errors, words(lanes.lobe)), _fallback(situation, found, len(s)))
 
 
 def _literal_coordinates(situation: Situation) -> Measured:
