@@ -157,6 +157,41 @@ def render(
 
 
 @app.command()
+def inspect(
+    scene: Annotated[Path, typer.Argument(help="Scene in Mitsuba's XML format.")],
+    variant: Annotated[str, typer.Option("--variant", "-m", help="Variant.")] = "llvm_ad_rgb",
+    define: Annotated[
+        list[str] | None,
+        typer.Option("--define", "-D", metavar="KEY=VALUE", help="Parameter $KEY of the scene."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON list.")] = False,
+) -> int:
+    """Say what a scene needs of the photon mapper, what is left out, and why.
+
+    A scene whose integrator is another one is inspected for aniso_pm with default parameters.
+    """
+    if not scene.is_file():
+        raise InputError(f"{scene}: there is no such file")
+    _set_variant(variant)
+    with _mitsuba_log(quiet=False):
+        world, _, integrator = _load(scene, _parse_defines(define or []), 0)
+        from aniso_pm import inspect as inspection
+        from aniso_pm.prepared import prepare
+        from aniso_pm.settings import Settings
+
+        settings = getattr(integrator, "settings", None) or Settings()
+        try:
+            findings = inspection.examine(prepare(world, settings, False))
+        except ValueError as error:
+            raise InputError(one_line(error)) from error
+    if as_json:
+        print(json.dumps(inspection.as_data(findings), indent=2, ensure_ascii=False))
+    else:
+        print(inspection.as_text(findings))
+    return 0
+
+
+@app.command()
 def stability(
     out: Annotated[Path, typer.Option("--output", "-o", help="Directory to write into.")],
     variant: Annotated[str, typer.Option("--variant", "-m", help="Variant.")] = "llvm_ad_rgb",

@@ -4,8 +4,9 @@ With M light paths and photons of flux Φ_j at offsets d_j, the irradiance at p1
 
     E ≈ Σ_j Φ_j w(d_j) / (M · π |s × t| · (1 − e^−4) · m),    w = exp(−a² − b²), a² + b² <= 4
 
-and the reflected radiance E times the BRDF of p1. Photons count only if they lie on the same
-surface: |d·n| within half a bandwidth and normals within 41 degrees (cosine 0.75).
+and the reflected radiance is E times the BRDF of p1; on receivers that are not Lambertian every
+photon brings its own direction, and the BRDF goes into the sum. Photons count only if they lie on
+the same surface: |d·n| within half a bandwidth and normals within 41 degrees (cosine 0.75).
 
 m is the share of the kernel that lies on such a surface. Without it every estimate near an edge
 loses what its kernel spills over the edge. Points drawn from the kernel are probed by short rays
@@ -27,7 +28,15 @@ import mitsuba as mi
 from . import index as spatial
 from .eye import GatherPoints
 from .kernel import PlaneKernel, disc, guarded_axes
-from .photons import PhotonMap, decode_normal, photon_flux, segments
+from .photons import (
+    PhotonMap,
+    decode_normal,
+    is_caustic,
+    photon_direction,
+    photon_flux,
+    segments,
+)
+from .receivers import gathered_part
 
 CUT2 = 4.0
 KERNEL_MASS = 1 - math.exp(-CUT2)
@@ -54,6 +63,7 @@ class KernelOptions:
 class Gathered:
     """What density estimation found, one lane a gather point.
 
+    lane        index of the eye path.
     radiance    reflected radiance, W/m²/sr.
     photons     photons inside the kernel.
     follows     the kernel follows a lobe (else it is the disc).
@@ -63,6 +73,7 @@ class Gathered:
     lost        no part of the kernel was found to lie on the surface.
     """
 
+    lane: Any
     radiance: Any
     photons: Any
     follows: Any
@@ -102,38 +113,74 @@ def kernels(points: GatherPoints, radius, options: KernelOptions) -> tuple[Plane
 
 
 def estimate(
-    photons: PhotonMap, points: GatherPoints, kernel: PlaneKernel, radius, max_depth, active
+    photons: PhotonMap,
+    points: GatherPoints,
+    kernel: PlaneKernel,
+    radius,
+    max_depth,
+    active,
+    surface=None,
 ):
     """(reflected radiance, photons inside the kernel) of each gather point, edges not yet
     compensated.
 
-    max_depth: path segments of camera and light path together, or 0 for no limit (or none that
-    the map does not already keep).
+    max_depth  path segments of camera and light path together, or 0 for no limit (or none that
+               the map does not already keep).
+    surface    Surface of receivers that are not Lambertian.
     """
     ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
     n = mi.Vector3f(points.n)
     allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
 
     def visit(total, slot, word, rho2, inside):
-        irradiance, missing, count = total
+        reflected, missing, count = total
         inside &= dr.dot(decode_normal(word), n) > NORMAL_COS
         if max_depth:
             inside &= segments(word) <= allowed
-        weight = dr.select(inside, dr.exp(-rho2), 0)
+        if points.caustic is not None:
+            inside &= is_caustic(word) | ~points.caustic
+        light = photon_flux(photons, slot, inside) * dr.select(inside, dr.exp(-rho2), 0)
+        if surface is not None:
+            light *= surface.brdf(photon_direction(photons, slot, inside), inside)
         # Kahan's sum: what rounding took from the total goes into the next term. A plain sum is
         # off by 1 % after a million equal photons.
-        term = weight * photon_flux(photons, slot, inside) - missing
-        sum_ = irradiance + term
-        return sum_, (sum_ - irradiance) - term, count + dr.select(inside, mi.UInt32(1), 0)
+        term = light - missing
+        sum_ = reflected + term
+        return sum_, (sum_ - reflected) - term, count + dr.select(inside, mi.UInt32(1), 0)
 
     total = (mi.Spectrum(0), mi.Spectrum(0), mi.UInt32(0))
-    irradiance, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active)
+    reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active)
     area = dr.pi * dr.sqrt(dr.squared_norm(kernel.s)) * dr.sqrt(dr.squared_norm(kernel.t))
-    return points.weight * irradiance / (area * (KERNEL_MASS * photons.emitted)), count
+    return points.weight * reflected / (area * (KERNEL_MASS * photons.emitted)), count
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The gathered parts of the BSDFs at gather points; ``roughness`` as in ``receivers``."""
+
+    bsdf: Any
+    si: Any
+    roughness: float
+
+    @staticmethod
+    def at(scene, points: GatherPoints, roughness: float, wavelengths) -> Surface:
+        """Found again by the rays that found it first."""
+        ray = mi.Ray3f(points.origin, points.d)
+        if wavelengths is not None:
+            ray.wavelengths = wavelengths
+        si = scene.ray_intersect(ray)
+        return Surface(si.bsdf(ray), si, roughness)
+
+    def brdf(self, direction, active):
+        """BRDF value (1/sr) towards the viewer for light from a world-space direction."""
+        wo = self.si.to_local(direction)
+        value = gathered_part(self.bsdf, self.si, wo, self.roughness, active)
+        # Photons of a curved surface may come from just below this tangent plane: no value there.
+        return dr.select(value != 0, value / dr.abs(mi.Frame3f.cos_theta(wo)), 0)
 
 
 @dr.syntax
-def probe_surface(scene, sampler, points: GatherPoints, kernel: PlaneKernel, radius, active):
+def probe_surface(scene, seed: int, points: GatherPoints, kernel: PlaneKernel, radius, active):
     """(1/m, nothing found?): the inverse share of each kernel that lies on the surface.
 
     1 where none of PROBES_MAX points lay on one, which says more about the surface (finer than
@@ -141,12 +188,15 @@ def probe_surface(scene, sampler, points: GatherPoints, kernel: PlaneKernel, rad
     """
     n = mi.Vector3f(points.n)
     height = SLAB * radius
+    # Random numbers of the eye path and vertex, whatever the order of the points.
+    state, sequence = mi.sample_tea_32(points.lane, points.depth + dr.opaque(mi.UInt32, seed))
+    random = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
     tries = mi.UInt32(0)
     landed = mi.Bool(False)
     probing = mi.Bool(active)
     while probing:
         tries += 1
-        u = sampler.next_2d(probing)
+        u = mi.Point2f(random.next_float32(), random.next_float32())
         sin_phi, cos_phi = dr.sincos(dr.two_pi * u.y)
         rho = dr.sqrt(-dr.log(1 - u.x * KERNEL_MASS))
         q = points.p + kernel.s * (rho * cos_phi) + kernel.t * (rho * sin_phi)

@@ -1,14 +1,17 @@
-"""Camera paths up to the gather point.
+"""Camera paths up to their gather points.
 
 A path is traced as Mitsuba's ``path`` does (emitter sampling and BSDF sampling, combined by the
-power heuristic) until it meets a receiver. There it still takes the direct light, by both
-techniques, and becomes a gather point: everything that reaches the receiver over two path
-segments or more is the photon map's. A path that never meets a receiver is path tracing and nothing
-else, so the two halves together count every light path exactly once.
+power heuristic). At a receiver the gathered part of its BSDF (see ``receivers``) leaves a gather
+point: what arrives there over two path segments or more is the photon map's. What is left for the
+path depends on how the map is used:
 
-Along the way the path remembers the reflection lobe of its last glossy vertex, where that vertex
-was anisotropic. Mirrors between the lobe and the gather point reflect the lobe along; refraction
-turns it by the angle between the rays.
+global        the gathered part ends there, except for direct light; the walked part goes on.
+caustic       the map holds caustics alone: light → walked parts → gathered part. The path goes on
+              with both parts, and drops emission and direct light that reach a gathered part over
+              one walked part or more, because the map has them.
+final gather  "caustic" up to the first gathered part, "global" from there on.
+
+Each light path is counted exactly once in all three.
 """
 
 from __future__ import annotations
@@ -19,110 +22,185 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .asg import ASG
-from .ndf import asg_from_roughness, read_roughness
-from .needs import receiver_reflectance
+from .lobe_path import LobeOnPath, follow, no_lobe
 from .rays import largest_coordinate, spawn_ray
-from .warp import warp_to_reflection
-
-# Roughness ratio from which on a lobe counts as anisotropic.
-ASPECT_MIN = 1.01
+from .receivers import gathered_part, read_receiver
 
 
-@dataclass
-class LobeOnPath:
-    """The lobe that the kernel follows: the ASG in world space, the direction r in which the path
-    left it, the distance travelled since, and whether there is one."""
+@dataclass  # not frozen: Dr.Jit writes back whatever a loop mentions
+class WalkOptions:
+    """Decisions for one scene; what is off is not traced.
 
-    lobe: Any
-    r: Any
-    distance: Any
-    valid: Any
+    use            "global", "caustic" or "final_gather", see above.
+    max_depth      segments of the longest light path.
+    rr_depth       segments after which Russian roulette begins.
+    min_segments   segments of the shortest light path that the map holds (2; 1 where the scene has
+                   direct light that only the map knows).
+    hide_emitters  directly visible emitters are invisible.
+    follow_lobes   keep the anisotropic lobe of the last glossy vertex (``needs.lobes``).
+    deep           the scene has surfaces to walk on (``needs.chains``).
+    general        the scene has receivers that are not Lambertian (``needs.general``).
+    roughness      smallest alpha that is gathered on.
+    """
+
+    use: str
+    max_depth: int
+    rr_depth: int
+    min_segments: int
+    hide_emitters: bool
+    follow_lobes: bool
+    deep: bool
+    general: bool
+    roughness: float
 
 
 @dataclass
 class GatherPoints:
-    """Where eye paths ended on receivers, one lane an eye path.
+    """Places where eye paths read the photon map, in no particular order.
 
-    active    is there a gather point?
-    p, n      position; geometric normal of the side that is seen.
-    weight    path throughput times BRDF (Spectrum, 1/sr): radiance per irradiance.
-    depth     path segments from the camera.
-    path      LobeOnPath, or None where the scene has no anisotropic lobes.
+    lane       index of the eye path.
+    p, n       position; geometric normal of the side that is seen.
+    weight     path throughput; times the BRDF value (1/sr) where the receiver is Lambertian.
+    depth      path segments from the camera.
+    path       LobeOnPath, or None where the scene has no anisotropic lobes.
+    origin, d  ray that found p, or None where all receivers are Lambertian.
+    lambertian is the receiver Lambertian? None where all are.
+    caustic    only caustic photons are to be read; None where all points agree.
     """
 
-    active: Any
+    lane: Any
     p: Any
     n: Any
     weight: Any
     depth: Any
-    path: Any
+    path: LobeOnPath | None
+    origin: Any
+    d: Any
+    lambertian: Any
+    caustic: Any
 
 
-def take_lanes(value, lanes):
-    """The given lanes of a tree of dataclasses and Dr.Jit arrays (constants stay as they are)."""
-    if value is None:
+def map_tree(function, *trees):
+    """Apply a function to the Dr.Jit arrays of equal trees of dataclasses (None stays None)."""
+    first = trees[0]
+    if first is None:
         return None
-    if is_dataclass(value):
-        return type(value)(
-            **{f.name: take_lanes(getattr(value, f.name), lanes) for f in fields(value)}
+    if is_dataclass(first):
+        return type(first)(
+            **{
+                f.name: map_tree(function, *(getattr(t, f.name) for t in trees))
+                for f in fields(first)
+            }
         )
-    return value if dr.width(value) == 1 else dr.gather(type(value), value, lanes)
+    return function(*trees)
+
+
+def take(points, index):
+    """The given entries of gather points (or of any tree of dataclasses and Dr.Jit arrays)."""
+    return map_tree(lambda v: dr.gather(type(v), v, index), points)
+
+
+def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0):
+    """Trace camera paths: (radiance, valid, GatherPoints or None).
+
+    radiance  W/m²/sr: emission, direct light, and whatever the map does not stand for. NaN where
+              the throughput at a gather point is not finite.
+    valid     did the ray meet anything but null surfaces and, if they are hidden, emitters?
+              (alpha, as in ``path``)
+    expected  gather points to make room for; with too few the same paths are traced again.
+    """
+    # Without mixed receivers a path ends where it leaves its first gather point.
+    single = options.use == "global" and not options.general
+    capacity = dr.width(ray) if single else max(2 * dr.width(ray), expected + expected // 8)
+    while True:
+        rows = dr.zeros(mi.UInt32, 1)
+        points = map_tree(lambda v: dr.empty(type(v), capacity), _blank(options))  # noqa: B023
+        room = dr.opaque(mi.UInt32, capacity)
+
+        def push(point, active):
+            slot = dr.scatter_inc(rows, mi.UInt32(0), active)  # noqa: B023
+            active = active & (slot < room)  # noqa: B023
+
+            def put(column, value):
+                dr.scatter(column, value, slot, active)
+                return column
+
+            map_tree(put, points, point)  # noqa: B023
+
+        L, valid = _walk(scene, sampler.clone(), ray, options, push)
+        dr.eval(L, valid, rows, points)
+        found = int(rows[0])
+        if found <= capacity:
+            break
+        capacity = found + found // 16
+    return L, valid, take(points, dr.arange(mi.UInt32, found)) if found else None
+
+
+def _first_lobe(o: WalkOptions) -> LobeOnPath | None:
+    return no_lobe() if o.follow_lobes else None
+
+
+def _point(o: WalkOptions, lane, si, ray, weight, depth, path, lambertian, scattered):
+    """A gather point with the fields that the scene needs."""
+    return GatherPoints(
+        lane=lane,
+        p=si.p,
+        n=dr.mulsign(si.n, dr.dot(-ray.d, si.n)),
+        weight=weight,
+        depth=depth,
+        path=path,
+        origin=ray.o if o.general else None,
+        d=ray.d if o.general else None,
+        lambertian=lambertian if o.general else None,
+        caustic=~scattered if o.use == "final_gather" else None,
+    )
+
+
+def _blank(o: WalkOptions) -> GatherPoints:
+    si, ray = dr.zeros(mi.SurfaceInteraction3f), dr.zeros(mi.Ray3f)
+    no = mi.Bool(False)
+    return _point(o, mi.UInt32(0), si, ray, mi.Spectrum(0), mi.UInt32(0), _first_lobe(o), no, no)
 
 
 @dr.syntax
-def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, deep, active):
-    """Trace camera paths to their gather points: (radiance, valid, GatherPoints).
-
-    radiance       emission, direct light and light of paths without a receiver, W/m²/sr.
-    valid          did the ray meet anything but null surfaces and, if they are hidden, emitters?
-                   (alpha, as in ``path``)
-    follow_lobes   keep the anisotropic lobe of the last glossy vertex (``needs.lobes``).
-    deep           the scene has surfaces to walk through (``needs.chains``).
-    """
+def _walk(scene, sampler, ray, options, push):
     ctx = mi.BSDFContext()
-    max_depth, rr_depth = dr.opaque(mi.UInt32, max_depth), dr.opaque(mi.UInt32, rr_depth)
+    o = options
+    max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
     reach = dr.opaque(mi.Float, largest_coordinate(scene))
 
     ray = mi.Ray3f(ray)  # Current ray
+    lane = dr.arange(mi.UInt32, dr.width(ray))
     depth = mi.UInt32(1)  # Path segments up to the vertex that is looked at
     L = mi.Spectrum(0)  # Radiance so far
-    β = mi.Spectrum(1)  # Path throughput
+    β = mi.Spectrum(1)  # Throughput of the path that goes on
+    β_direct = mi.Spectrum(1)  # Throughput of emission at the next vertex
     η = mi.Float(1)  # Relative index of refraction along the path
-    active = mi.Bool(active)  # Lanes with a path to follow
-    valid = mi.Bool(not hide_emitters and scene.environment() is not None)  # Anything seen?
-    gathered = mi.Bool(False)  # The last vertex was a receiver: only its direct light is missing
+    active = mi.Bool(True)  # Lanes with a path to follow
+    valid = mi.Bool(not o.hide_emitters and scene.environment() is not None)  # Anything seen?
+    scattered = mi.Bool(False)  # Has the path left a gathered part? ("caustic", "final_gather")
     si_prev = dr.zeros(mi.Interaction3f)  # Last vertex
     pdf_prev = mi.Float(1)  # Density of the last BSDF sample
     delta_prev = mi.Bool(True)  # Was it a delta distribution (or the camera)?
-    points = GatherPoints(
-        mi.Bool(False),
-        mi.Point3f(0),
-        mi.Normal3f(0, 0, 1),
-        mi.Spectrum(0),
-        mi.UInt32(0),
-        no_lobe() if follow_lobes else None,
-    )
-    path = no_lobe() if follow_lobes else None
+    path = _first_lobe(o)
 
     while dr.hint(active, label="eye paths"):
         # --- Find the next vertex ---
         si = scene.ray_intersect(ray, active)
-        first = depth == 1
-        if dr.hint(hide_emitters, mode="scalar"):
-            si = _skip_emitters(scene, ray, si, active & first)
+        if dr.hint(o.hide_emitters, mode="scalar"):
+            si, ray = _skip_emitters(scene, ray, si, active & (depth == 1))
 
         # --- Emission, weighted against emitter sampling at the last vertex ---
         ds = mi.DirectionSample3f(scene, si, si_prev)
         seen = active & (ds.emitter != None)  # noqa: E711 (a Dr.Jit comparison)
-        if dr.hint(hide_emitters, mode="scalar"):
+        if dr.hint(o.hide_emitters, mode="scalar"):
             # As path does: the environment appears once a surface has been seen.
             seen &= valid | si.is_valid()
         pdf_emitter = scene.pdf_emitter_direction(si_prev, ds, seen & ~delta_prev)
         mis = dr.select(delta_prev, 1, _power_heuristic(pdf_prev, pdf_emitter))
-        L[seen] = dr.fma(β, mis * ds.emitter.eval(si, seen), L)
+        L[seen] = dr.fma(β_direct, mis * ds.emitter.eval(si, seen), L)
         on_surface = active & si.is_valid()
-        active &= si.is_valid() & (depth < max_depth) & ~gathered
+        active &= si.is_valid() & (depth < max_depth) & (dr.max(β) > 0)
 
         # --- Direct light by emitter sampling ---
         bsdf = si.bsdf(ray)
@@ -131,54 +209,67 @@ def walk(scene, sampler, ray, max_depth, rr_depth, hide_emitters, follow_lobes, 
         sample_light &= ds.pdf != 0
         wo = si.to_local(ds.d)
         f, pdf = bsdf.eval_pdf(ctx, si, wo, sample_light)
+        if dr.hint(o.use != "global" and o.deep, mode="scalar"):
+            # Over a walked part to a gathered one: the map has it.
+            f = dr.select(scattered, gathered_part(bsdf, si, wo, o.roughness, sample_light), f)
         mis = dr.select(ds.delta, 1, _power_heuristic(ds.pdf, pdf))
         L[sample_light] = dr.fma(β, mis * f * light, L)
 
-        # --- Is this a gather point? ---
-        is_receiver, reflectance = receiver_reflectance(bsdf, si, active)
-        gathered = active & is_receiver
-        here = gathered & (depth + 2 <= max_depth) & (dr.max(reflectance) > 0)
-        points.active |= here
-        points.p = dr.select(here, si.p, points.p)
-        points.n = dr.select(here, dr.mulsign(si.n, dr.dot(-ray.d, si.n)), points.n)
-        points.weight = dr.select(here, β * reflectance, points.weight)
-        points.depth = dr.select(here, depth, points.depth)
-        if dr.hint(follow_lobes, mode="scalar"):
+        # --- Leave a gather point ---
+        is_receiver, lambertian, brdf = read_receiver(bsdf, si, o.roughness, o.general, active)
+        is_receiver &= active
+        weight = dr.select(lambertian, β * brdf, β)
+        here = is_receiver & (depth + o.min_segments <= max_depth)
+        finite = dr.all(dr.isfinite(weight))
+        L[here & ~finite] = dr.nan  # counted and dropped later
+        if dr.hint(o.follow_lobes, mode="scalar"):
             path.distance += dr.select(active, si.t, 0)
-            points.path = dr.select(here, path, points.path)
+        push(_point(o, lane, si, ray, weight, depth, path, lambertian, scattered), here & finite)
 
-        # --- Sample the BSDF: one more segment for direct light, or the path goes on ---
+        # --- Sample the BSDF ---
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
-        if dr.hint(follow_lobes, mode="scalar"):
-            path = _follow(path, bsdf, si, ray, bs, active & ~gathered)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        # Share of the gathered part in the sampled direction
+        g = dr.select(is_receiver, mi.Spectrum(1), mi.Spectrum(0))
+        if dr.hint(o.general, mode="scalar"):
+            mixed = is_receiver & ~lambertian
+            f_g = gathered_part(bsdf, si, bs.wo, o.roughness, mixed & ~delta)
+            f = bsdf.eval(ctx, si, bs.wo, mixed & ~delta)
+            share = dr.select(f > 0, dr.clip(f_g / f, 0, 1), 0)
+            g = dr.select(mixed, dr.select(delta, 0, share), g)
+        if dr.hint(o.follow_lobes, mode="scalar"):
+            path = follow(path, bsdf, si, ray, bs, active & ~(dr.min(g) == 1))
         valid |= on_surface & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         ray = spawn_ray(si, si.to_world(bs.wo), reach)
-        β *= weight
+        β_direct = β * weight
+        if dr.hint(o.use == "global", mode="scalar"):
+            β = β_direct * (1 - g)
+        else:
+            # The path goes on with one of the parts, chosen by its share.
+            before = scattered
+            chance = dr.mean(g)
+            gathers = sampler.next_1d(active) < chance
+            β = β_direct * dr.select(gathers, g / chance, (1 - g) / (1 - chance))
+            if dr.hint(o.use == "final_gather", mode="scalar"):
+                β = dr.select(before, β_direct * (1 - g), β)
+            scattered |= gathers
+            β_direct = dr.select(before, β_direct * g, β_direct)
         η *= bs.eta
         si_prev = mi.Interaction3f(si)
         pdf_prev = bs.pdf
-        delta_prev = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        active &= dr.max(β) > 0
-        if dr.hint(not deep, mode="scalar"):
-            active &= gathered
+        delta_prev = delta
+        active &= (dr.max(β) > 0) | (dr.max(β_direct) > 0)
 
-        # --- Russian roulette ---
-        if dr.hint(deep, mode="scalar"):
+        # --- Russian roulette, for paths that go on ---
+        if dr.hint(o.deep or o.use != "global", mode="scalar"):
             survive = dr.minimum(dr.max(β) * η * η, 0.95)
-            roulette = (depth >= rr_depth) & ~gathered
+            roulette = (depth >= rr_depth) & (dr.max(β) > 0)
             active &= ~roulette | (sampler.next_1d(active) < survive)
-            β[roulette] = β * dr.rcp(survive)
+            scale = dr.select(roulette, dr.rcp(survive), 1)
+            β *= scale
+            β_direct *= scale
         depth += 1
-
-    # A throughput that is not finite makes the whole sample so: it is counted and dropped later.
-    L = dr.select(dr.all(dr.isfinite(points.weight)), L, dr.nan)
-    return L, valid, points
-
-
-def no_lobe() -> LobeOnPath:
-    """A path that has not met an anisotropic lobe."""
-    lobe = ASG(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1), 1, 1)
-    return LobeOnPath(lobe, mi.Vector3f(0, 0, 1), mi.Float(0), mi.Bool(False))
+    return L, valid
 
 
 def _power_heuristic(a, b):
@@ -188,51 +279,14 @@ def _power_heuristic(a, b):
 
 @dr.syntax
 def _skip_emitters(scene, ray, si, active):
-    """The first surface behind directly visible area lights (``hide_emitters``)."""
+    """The first surface behind directly visible area lights (``hide_emitters``), and the ray that
+    finds it."""
     ray = mi.Ray3f(ray)
     active = active & si.is_valid()
     active &= si.emitter(scene) != None  # noqa: E711
     while active:
-        ray = si.spawn_ray(ray.d)
+        ray[active] = si.spawn_ray(ray.d)
         si[active] = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         active &= si.emitter(scene) != None  # noqa: E711
-    return si
-
-
-def _follow(path: LobeOnPath, bsdf, si, ray, bs, active) -> LobeOnPath:
-    """The lobe after scattering at a vertex: a new one at glossy vertices, the old one carried
-    along at delta vertices."""
-    alpha_u, alpha_v = read_roughness(bsdf, si, active)
-    large, small = dr.maximum(alpha_u, alpha_v), dr.minimum(alpha_u, alpha_v)
-    glossy = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Glossy)
-    # Lobes of reflection; the transmitted lobe of a rough dielectric has another shape.
-    reflected = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo) > 0
-    anisotropic = glossy & reflected & (small > 0) & (large > ASPECT_MIN * small)
-
-    # The warped lobe on the side that the viewer is on (the NDF is symmetric in z).
-    flip = mi.Vector3f(1, 1, dr.mulsign(mi.Float(1), mi.Frame3f.cos_theta(si.wi)))
-    ndf = asg_from_roughness(dr.select(anisotropic, alpha_u, 1), dr.select(anisotropic, alpha_v, 1))
-    warped = warp_to_reflection(ndf, si.wi * flip)
-    to_world = lambda w: si.to_world(w * flip)  # noqa: E731
-    fresh = ASG(to_world(warped.x), to_world(warped.y), to_world(warped.z), warped.lam, warped.mu)
-    r = si.to_world(bs.wo)
-
-    # A mirror's householder reflection, or the smallest rotation between the rays.
-    middle = r + ray.d
-    normal = r - ray.d
-    scale_rotation = dr.rcp(dr.maximum(1 + dr.dot(r, ray.d), 1e-6))
-    scale_mirror = 2 * dr.rcp(dr.maximum(dr.squared_norm(normal), 1e-12))
-
-    def carry(w):
-        turned = w - middle * (dr.dot(w, middle) * scale_rotation) + r * (2 * dr.dot(w, ray.d))
-        mirrored = w - normal * (dr.dot(w, normal) * scale_mirror)
-        return dr.select(reflected, mirrored, turned)
-
-    old = path.lobe
-    carried = ASG(carry(old.x), carry(old.y), carry(old.z), old.lam, old.mu)
-    delta = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    lobe = dr.select(anisotropic, fresh, dr.select(delta, carried, old))
-    direction = dr.select(anisotropic, r, dr.select(delta, carry(path.r), path.r))
-    distance = dr.select(anisotropic | (active & ~delta), 0, path.distance)
-    return LobeOnPath(lobe, direction, distance, dr.select(delta, path.valid, anisotropic))
+    return si, ray

@@ -12,9 +12,9 @@ def pixel_count(film) -> int:
     return width * height
 
 
-def sample_rays(sensor, sampler, spp):
+def sample_rays(sensor, sampler, spp, wavelength):
     """Camera rays of one wavefront: (ray, weight, position on the film), spp samples a pixel in
-    consecutive lanes."""
+    consecutive lanes. wavelength: the sample in [0, 1) that chooses wavelengths for all of them."""
     film = sensor.film()
     width, height = _sampled_size(film)
     lane = dr.arange(mi.UInt32, width * height * spp)
@@ -30,22 +30,39 @@ def sample_rays(sensor, sampler, spp):
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
-    wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
-    ray, weight = sensor.sample_ray(time, wavelength, normalised, aperture)
+    u = dr.opaque(mi.Float, wavelength)
+    ray, weight = sensor.sample_ray(time, u, normalised, aperture)
     # With a box filter the offset within the pixel only adds rounding errors at pixel borders.
     splat_at = mi.Point2f(corner) if film.rfilter().is_box_filter() else position
     return ray, weight, splat_at
 
 
-def splat(film, position, radiance, valid, spp):
+def wavelengths(sensor, u):
+    """Wavelengths (nm) that a wavelength sample stands for, the same for all rays of a sensor."""
+    centre = mi.Point2f(0.5)
+    ray, _ = sensor.sample_ray(mi.Float(sensor.shutter_open()), mi.Float(u), centre, centre)
+    return ray.wavelengths
+
+
+def splat(film, position, radiance, valid, spp, wavelengths):
     """Add one wavefront of samples to the film. valid: alpha is 1 there, else 0."""
     block = film.create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
-    rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else radiance
-    channels = [rgb.x, rgb.y, rgb.z]
-    if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
-        channels.append(dr.select(valid, mi.Float(1), mi.Float(0)))
-    channels.append(mi.Float(1))
+    alpha = dr.select(valid, mi.Float(1), mi.Float(0))
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        channels = film.prepare_sample(
+            radiance, wavelengths, block.channel_count(), mi.Float(1), alpha
+        )
+    else:
+        rgb = radiance
+        if mi.is_spectral:
+            rgb = mi.spectrum_to_srgb(radiance, wavelengths)
+        elif mi.is_monochromatic:
+            rgb = mi.Color3f(radiance.x)
+        channels = [rgb.x, rgb.y, rgb.z]
+        if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+            channels.append(alpha)
+        channels.append(mi.Float(1))
     block.put(position, channels)
     film.put_block(block)
     film.schedule_storage()

@@ -14,6 +14,8 @@ ln G = ln cos θ − λ sin²θ = −(λ + 1/2) θ² + O(θ⁴) along the tangen
 
 from __future__ import annotations
 
+from functools import cache
+
 import drjit as dr
 import mitsuba as mi
 
@@ -63,21 +65,24 @@ def asg_from_roughness(alpha_u, alpha_v, distribution="beckmann", match="peak") 
 # --- Reading the roughness of a Mitsuba BSDF ---------------------------------------------------
 
 
-def children(bsdf) -> dict:
-    """Name → object or value of everything a BSDF hands to ``mi.traverse``, one level deep."""
-
-    class Collect(mi.TraversalCallback):
-        def __init__(self):
-            super().__init__()
-            self.found = {}
-
-        def put(self, name, value, flags, cpptype=None):
-            # Plain values come as pointers with the name of their type.
-            self.found[name] = mi.get_property(value, cpptype, bsdf) if cpptype else value
-
-    collect = Collect()
-    bsdf.traverse(collect)
+def children(node) -> dict:
+    """Name → object or value of everything an object hands to ``mi.traverse``, one level deep."""
+    collect = _collector(mi.variant())()
+    # Not by a closure: classes live until the garbage collector comes, and would keep the node of a
+    # scene that is gone. Dr.Jit would go on calling it.
+    collect.node, collect.found = node, {}
+    node.traverse(collect)
     return collect.found
+
+
+@cache
+def _collector(variant: str):
+    class Collect(mi.TraversalCallback):
+        def put(self, name, value, flags, cpptype=None):
+            plain = cpptype is not None  # a number inside the object, behind a pointer
+            self.found[name] = mi.get_property(value, cpptype, self.node) if plain else value
+
+    return Collect
 
 
 def nested_bsdfs(found: dict) -> list:
@@ -85,14 +90,10 @@ def nested_bsdfs(found: dict) -> list:
     return [value for value in found.values() if isinstance(value, mi.BSDF)]
 
 
-def roughness_source(bsdf):
-    """How to read the roughness of a BSDF, looking through wrappers: a function of (si, active)
-    that returns (alpha_u, alpha_v), or None where the BSDF has no roughness that can be read.
-
-    Wrappers (``twosided``, ``mask``, ``bumpmap``, ``normalmap``, ``blendbsdf``) are seen through
-    to the first nested BSDF that has a roughness, the back side of ``twosided`` apart. Roughness is
-    at least 1e-4, as in Mitsuba's own distributions.
-    """
+def own_roughness(bsdf):
+    """How to read the roughness of a BSDF by itself: a function of (si, active) that returns
+    (alpha_u, alpha_v), or None where it has none that can be read (wrappers have none). Roughness
+    is at least 1e-4, as in Mitsuba's own distributions."""
     found = children(bsdf)
 
     def value(name, si, active):
@@ -106,7 +107,7 @@ def roughness_source(bsdf):
         return lambda si, active: (alpha("alpha_u", si, active), alpha("alpha_v", si, active))
     if "alpha" in found:
         return lambda si, active: (alpha("alpha", si, active),) * 2
-    if "roughness" in found and "spec_tint" in found or "anisotropic" in found:
+    if "roughness" in found and ("spec_tint" in found or "anisotropic" in found):
         # Mitsuba's principled BSDFs, after Burley (2012).
         def principled(si, active):
             r2 = dr.square(value("roughness", si, active))
@@ -115,7 +116,17 @@ def roughness_source(bsdf):
             return dr.maximum(r2 / aspect, 1e-3), dr.maximum(r2 * aspect, 1e-3)
 
         return principled
+    return None
 
+
+def roughness_source(bsdf):
+    """``own_roughness`` through wrappers (``twosided``, ``mask``, ``bumpmap``, ``normalmap``,
+    ``blendbsdf``): that of the first nested BSDF that has one; ``twosided`` takes the side seen.
+    """
+    own = own_roughness(bsdf)
+    if own is not None:
+        return own
+    found = children(bsdf)
     sources = [roughness_source(nested) for nested in nested_bsdfs(found)]
     if bsdf.class_name() == "TwoSidedBRDF" and len(sources) == 2 and all(sources):
         front, back = sources

@@ -1,18 +1,14 @@
-"""What this scene needs. Read once per scene, in Python; the rest is never traced.
-
-A surface is a *receiver* if photons are stored and gathered on it: Lambertian reflection, seen
-through ``twosided`` and ``blendbsdf``. Every other BSDF is walked through by photons and by eye
-paths alike, exactly as ``path`` would, so a scene of unusual materials is at worst noisier.
-"""
+"""What this scene needs. Read once per scene, in Python; the rest is never traced."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import drjit as dr
 import mitsuba as mi
 
+from .emission import only_photons_see
 from .ndf import children, nested_bsdfs, roughness_source
+from .receivers import is_lambertian, may_gather
 
 
 @dataclass(frozen=True)
@@ -20,29 +16,32 @@ class Needs:
     """Answers about one scene, with the evidence (shape: BSDF) for each.
 
     lobes      surfaces with a readable roughness that may be anisotropic.
-    chains     surfaces that eye paths walk through, so that a gather point may lie deeper than
-               the first vertex.
+    chains     surfaces that paths walk on, so that a gather point may lie deeper than the first
+               vertex, and caustics exist.
     receivers  surfaces that photons are stored on.
+    general    receivers that are not Lambertian.
+    unreadable glossy surfaces whose roughness cannot be read: kernels behind them are discs.
+    unseen     emitters whose direct light only photons can find.
     """
 
     lobes: list[str] = field(default_factory=list)
     chains: list[str] = field(default_factory=list)
     receivers: list[str] = field(default_factory=list)
+    general: list[str] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
+    unseen: list[str] = field(default_factory=list)
 
 
-def read_scene(scene) -> Needs:
-    """Inspect all BSDFs of a scene.
+def read_scene(scene, gather_roughness: float) -> Needs:
+    """Inspect all emitters and BSDFs of a scene. gather_roughness: see ``receivers``.
 
-    Raises ValueError naming the shape where the scene has participating media, or the emitter
-    where it has light that emitter sampling cannot find; neither is supported.
+    Raises ValueError naming the shape where the scene has participating media, or glossy surfaces
+    together with light that emitter sampling cannot find; neither is supported.
     """
     needs = Needs()
     for emitter in scene.emitters():
-        if emitter.class_name() == "DirectionalArea":
-            raise ValueError(
-                f'aniso_pm: emitter "{emitter.id()}" is a directionalarea light, whose direct '
-                'light cannot be sampled from the eye; use "directional", "spot" or "area" instead'
-            )
+        if only_photons_see(emitter):
+            needs.unseen.append(emitter_name(emitter))
     seen = set()
     for shape in scene.shapes():
         name = shape.id() or shape.class_name()
@@ -53,31 +52,46 @@ def read_scene(scene) -> Needs:
             )
         if shape.class_name() == "Instance":
             # Its shapes cannot be reached from Python: anything may be among them.
-            for need in (needs.lobes, needs.chains, needs.receivers):
+            for need in (needs.lobes, needs.chains, needs.receivers, needs.general):
                 need.append(f"{name}: Instance")
             continue
         bsdf = shape.bsdf()
         if bsdf is None or bsdf.ptr in seen:
             continue
         seen.add(bsdf.ptr)
-        evidence = f"{name}: {bsdf.class_name()}"
-        if is_lambertian(bsdf):
+        evidence = f"{name}: {_describe(bsdf)}"
+        if may_gather(bsdf, gather_roughness):
             needs.receivers.append(evidence)
+        if is_lambertian(bsdf):
             continue
+        if may_gather(bsdf, gather_roughness):
+            needs.general.append(evidence)
         needs.chains.append(evidence)
+        glossy = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+        if glossy and roughness_source(bsdf) is None:
+            needs.unreadable.append(evidence)
         if _may_be_anisotropic(bsdf):
             needs.lobes.append(evidence)
+        if needs.unseen and glossy:
+            raise ValueError(
+                f'aniso_pm: emitter "{needs.unseen[0]}" casts parallel light that glossy surfaces '
+                f'("{evidence}") cannot be lit by in this integrator; use "directional", "spot" or '
+                '"area" instead'
+            )
     return needs
 
 
-def is_lambertian(bsdf) -> bool:
-    """Does this BSDF reflect the same radiance in every direction, whatever the incident one?"""
-    if bsdf.class_name() == "SmoothDiffuse":
-        return True
-    if bsdf.class_name() in ("TwoSidedBRDF", "BlendBSDF"):
-        nested = nested_bsdfs(children(bsdf))
-        return len(nested) > 0 and all(is_lambertian(b) for b in nested)
-    return False
+def emitter_name(emitter) -> str:
+    return f"{emitter.id()}: {emitter.class_name()}".removeprefix(": ")
+
+
+def _describe(bsdf) -> str:
+    """Class names of a tree of BSDFs: TwoSidedBRDF(RoughConductor)."""
+    python = type(bsdf).__module__.split(".")[0] != "mitsuba"
+    name = type(bsdf).__name__ if python else bsdf.class_name()
+    distinct = {child.ptr: child for child in nested_bsdfs(children(bsdf))}  # twosided: twice one
+    nested = ", ".join(_describe(child) for child in distinct.values())
+    return f"{name}({nested})" if nested else name
 
 
 def _may_be_anisotropic(bsdf) -> bool:
@@ -88,18 +102,3 @@ def _may_be_anisotropic(bsdf) -> bool:
     if "alpha_u" in found or "anisotropic" in found:
         return True
     return any(_may_be_anisotropic(nested) for nested in nested_bsdfs(found))
-
-
-def receiver_reflectance(bsdf, si, active):
-    """(is a receiver, BRDF value in 1/sr) of the surfaces at si, for the side that si.wi is on.
-
-    bsdf: mi.BSDFPtr. The value is 0 on the back of one-sided surfaces. Decided once per BSDF.
-    """
-
-    def read(instance, si, active):
-        if instance is None or not is_lambertian(instance):  # None: a scene without shapes
-            return mi.Bool(False), mi.Spectrum(0)
-        up = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), mi.Frame3f.cos_theta(si.wi)))
-        return mi.Bool(True), instance.eval(mi.BSDFContext(), si, up, active)
-
-    return dr.dispatch(bsdf, read, si, active)

@@ -2,9 +2,12 @@
 
 Each of N light paths starts at an emitter with the flux that Mitsuba's emitter sampling gives it
 (whose mean over paths is the scene's emitted power) and is followed through the scene by BSDF
-sampling. At every receiver (see ``needs``) that it meets after at least one bounce, a photon is
-stored: position, normal of the side it came from, flux. Direct light is not stored; it is sampled
-from the eye.
+sampling. At every receiver (see ``receivers``) that it meets after at least one bounce, a photon is
+stored: position, normal of the side it came from, flux, and its direction where a receiver needs
+it. Direct light is not stored; it is sampled from the eye.
+
+A *caustic* photon comes over walked parts of BSDFs only. Where the map has to tell, every bounce
+decides at random which part it belongs to, by their shares in the sampled direction.
 
 Shading normals make light transport asymmetric. At a bounce the importance-transport factor
 |(wi·n_s)(wo·n_g)| / |(wo·n_s)(wi·n_g)| is applied [Veach 1997, Sec. 5.3]; at a deposit the
@@ -24,8 +27,9 @@ import drjit as dr
 import mitsuba as mi
 
 from . import index as spatial
-from .needs import receiver_reflectance
+from .emission import Emission, only_photons_see
 from .rays import largest_coordinate, spawn_ray
+from .receivers import gathered_part, read_receiver
 
 # Light paths traced at once: bounds the memory of a wavefront, not the number of photons.
 WAVEFRONT = 1 << 21
@@ -33,15 +37,40 @@ WAVEFRONT = 1 << 21
 _FIRST_GUESS = 2.0
 
 
+@dataclass  # not frozen: Dr.Jit writes back whatever a loop mentions
+class TraceOptions:
+    """Decisions for one scene; what is off is neither traced nor stored.
+
+    max_depth     segments of the longest light path that is stored (at least 2 to store any).
+    rr_depth      segments after which Russian roulette begins.
+    caustics      "ignored", "marked" in the photons' words, or "only" those are stored.
+    general       the scene has receivers that are not Lambertian: keep directions.
+    roughness     smallest alpha that is gathered on.
+    unseen_light  the scene has direct light that only photons can find.
+    wavelengths   nm, of all photons (spectral variants), else None.
+    """
+
+    max_depth: int
+    rr_depth: int
+    caustics: str
+    general: bool
+    roughness: float
+    unseen_light: bool
+    wavelengths: Any = None
+
+
 @dataclass(frozen=True)
 class PhotonMap:
     """Photons in the order of their spatial index.
 
     emitted    light paths traced: the estimate divides by it.
-    stored     photons in the map; 0 means that ``index`` and ``flux`` are None.
+    stored     photons in the map; 0 means that the arrays are None.
     rejected   fluxes that were not finite and were dropped: photons, and light paths that end.
-    index      word of a point: octahedral normal in 24 bits, number of path segments in 8.
+    index      word of a point: octahedral normal in 24 bits, number of path segments in 7, caustic
+               or not in the highest.
     flux       W, interleaved channels, padded to a power of two.
+    direction  where the light came from, 32 bits octahedral; None where no receiver needs it.
+    wavelengths  nm, in spectral variants; the flux is W/nm then.
     """
 
     emitted: int
@@ -49,31 +78,44 @@ class PhotonMap:
     rejected: int
     index: Any
     flux: Any
+    direction: Any
+    wavelengths: Any
+
+
+EMPTY = PhotonMap(0, 0, 0, None, None, None, None)
+# Segments that the word can tell apart: this number stands for itself and more.
+SEGMENTS_MAX = 127
 
 
 def build_map(
-    scene, photon_count: int, seed: int, max_depth: int, rr_depth: int, expected: int = 0
+    scene,
+    source: Emission,
+    photon_count: int,
+    seed: int,
+    options: TraceOptions,
+    expected: int = 0,
 ):
-    """Trace ``photon_count`` light paths and index what they leave.
+    """Trace ``photon_count`` light paths from ``source`` and index what they leave.
 
-    max_depth  path segments of the longest light path that is stored (at least 2 to store any).
-    rr_depth   path segments after which Russian roulette begins.
-    expected   photons that an earlier map of the same scene stored (sizes the buffers).
+    expected  photons that an earlier map of the same scene stored (sizes the buffers).
     """
-    buffers = _trace(
-        scene, photon_count, seed, max_depth, rr_depth, expected or int(_FIRST_GUESS * photon_count)
+    stored, rejected, photons = _trace(
+        scene, source, photon_count, seed, options, expected or int(_FIRST_GUESS * photon_count)
     )
-    stored, rejected, position, word, flux = buffers
     if stored == 0:
-        return PhotonMap(photon_count, 0, rejected, None, None)
+        return PhotonMap(photon_count, 0, rejected, None, None, None, None)
     used = dr.arange(mi.UInt32, stored)
-    index = spatial.build(dr.gather(mi.Point3f, position, used), dr.gather(mi.UInt32, word, used))
-    width = _flux_width()
-    sorted_flux = dr.empty(mi.Float, stored * width)
-    packed = dr.gather(_packet(), flux, index.order)
-    dr.scatter(sorted_flux, packed, used)
-    dr.eval(sorted_flux)
-    return PhotonMap(photon_count, stored, rejected, index, sorted_flux)
+    position, word = (dr.gather(type(v), v, used) for v in (photons.position, photons.word))
+    index = spatial.build(position, word)
+    sorted_flux = dr.empty(mi.Float, stored * _flux_width())
+    dr.scatter(sorted_flux, dr.gather(_packet(), photons.flux, index.order), used)
+    direction = None
+    if options.general:
+        direction = dr.gather(mi.UInt32, photons.direction, index.order)
+    dr.eval(sorted_flux, direction)
+    return PhotonMap(
+        photon_count, stored, rejected, index, sorted_flux, direction, options.wavelengths
+    )
 
 
 def photon_flux(photons: PhotonMap, slot, active):
@@ -82,8 +124,18 @@ def photon_flux(photons: PhotonMap, slot, active):
     return mi.Spectrum(*(packed[k] for k in range(dr.size_v(mi.Spectrum))))
 
 
+def photon_direction(photons: PhotonMap, slot, active):
+    """Unit vector from the photon in a slot to where its light came from."""
+    return _decode(dr.gather(mi.UInt32, photons.direction, slot, active), 16)
+
+
 def _flux_width() -> int:
     return 1 if dr.size_v(mi.Spectrum) == 1 else 4
+
+
+def flux_bytes() -> int:
+    """Of the flux of one photon in the current variant."""
+    return 4 * _flux_width()
 
 
 def _packet():
@@ -93,82 +145,118 @@ def _packet():
 
 def encode_normal(n):
     """Unit vector → 24 bits (octahedral, 12 bits a coordinate: within 0.07 degrees)."""
-    n = n / (dr.abs(n.x) + dr.abs(n.y) + dr.abs(n.z))
-    fold_x = dr.mulsign(1 - dr.abs(n.y), n.x)
-    fold_y = dr.mulsign(1 - dr.abs(n.x), n.y)
-    x, y = dr.select(n.z < 0, fold_x, n.x), dr.select(n.z < 0, fold_y, n.y)
-    quantise = lambda v: mi.UInt32(dr.clip((0.5 * v + 0.5) * 4095 + 0.5, 0, 4095))  # noqa: E731
-    return quantise(x) | (quantise(y) << 12)
+    return _encode(n, 12)
 
 
 def decode_normal(word):
     """Inverse of ``encode_normal``; higher bits of the word are ignored."""
-    x = mi.Float(word & 0xFFF) * (2 / 4095) - 1
-    y = mi.Float((word >> 12) & 0xFFF) * (2 / 4095) - 1
+    return _decode(word, 12)
+
+
+def _encode(v, bits):
+    v = v / (dr.abs(v.x) + dr.abs(v.y) + dr.abs(v.z))
+    fold_x = dr.mulsign(1 - dr.abs(v.y), v.x)
+    fold_y = dr.mulsign(1 - dr.abs(v.x), v.y)
+    x, y = dr.select(v.z < 0, fold_x, v.x), dr.select(v.z < 0, fold_y, v.y)
+    top = 2**bits - 1
+    quantise = lambda c: mi.UInt32(dr.clip((0.5 * c + 0.5) * top + 0.5, 0, top))  # noqa: E731
+    return quantise(x) | (quantise(y) << bits)
+
+
+def _decode(word, bits):
+    top = 2**bits - 1
+    x = mi.Float(word & top) * (2 / top) - 1
+    y = mi.Float((word >> bits) & top) * (2 / top) - 1
     z = 1 - dr.abs(x) - dr.abs(y)
     fold = dr.maximum(-z, 0)
     return dr.normalize(mi.Vector3f(x - dr.mulsign(fold, x), y - dr.mulsign(fold, y), z))
 
 
 def segments(word):
-    """Number of path segments from the light to the photon (255 stands for 255 and more)."""
-    return word >> 24
+    """Number of path segments from the light to the photon (SEGMENTS_MAX: that many and more)."""
+    return (word >> 24) & SEGMENTS_MAX
 
 
-def _trace(scene, photon_count, seed, max_depth, rr_depth, capacity):
-    """(stored, rejected, position, word, flux) with buffers of at least ``stored`` entries."""
+def is_caustic(word):
+    """Did the photon come over walked parts of BSDFs only? (Maps that mark caustics.)"""
+    return (word >> 31) != 0
+
+
+@dataclass
+class _Photons:
+    position: Any
+    word: Any
+    flux: Any
+    direction: Any
+
+
+def _trace(scene, source, photon_count, seed, options, capacity):
+    """(stored, rejected, _Photons with buffers of at least ``stored`` entries)."""
     while True:
         capacity = max(capacity + capacity // 16, 1024)
-        position = dr.empty(mi.Point3f, capacity)
-        word = dr.empty(mi.UInt32, capacity)
-        flux = dr.empty(mi.Float, capacity * _flux_width())
+        photons = _Photons(
+            dr.empty(mi.Point3f, capacity),
+            dr.empty(mi.UInt32, capacity),
+            dr.empty(mi.Float, capacity * _flux_width()),
+            dr.empty(mi.UInt32, capacity) if options.general else None,
+        )
         stored, rejected = dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, 1)
+        room = dr.opaque(mi.UInt32, capacity)
+
+        def reject(active):
+            dr.scatter_add(rejected, mi.UInt32(1), mi.UInt32(0), active)  # noqa: B023
+
+        def store(position, word, flux, direction, active):
+            slot = dr.scatter_inc(stored, mi.UInt32(0), active)  # noqa: B023
+            active = active & (slot < room)  # noqa: B023
+            dr.scatter(photons.position, position, slot, active)  # noqa: B023
+            dr.scatter(photons.word, word, slot, active)  # noqa: B023
+            dr.scatter(photons.flux, _pack(flux), slot, active)  # noqa: B023
+            if options.general:
+                dr.scatter(photons.direction, _encode(direction, 16), slot, active)  # noqa: B023
+
         for first in range(0, photon_count, WAVEFRONT):
             sampler = mi.load_dict({"type": "independent"})
             sampler.seed(
                 mi.sample_tea_32(seed, first // WAVEFRONT)[0], min(WAVEFRONT, photon_count - first)
             )
-            _trace_wavefront(
-                scene,
-                sampler,
-                max_depth,
-                rr_depth,
-                capacity,
-                stored,
-                rejected,
-                position,
-                word,
-                flux,
-            )
-            dr.eval(position, word, flux, stored, rejected)
+            _trace_wavefront(scene, source, sampler, options, store, reject)
+            dr.eval(photons.position, photons.word, photons.flux, photons.direction)
+            dr.eval(stored, rejected)
         count = int(stored[0])
         if count <= capacity:
-            return count, int(rejected[0]), position, word, flux
+            return count, int(rejected[0]), photons
         capacity = count
 
 
 @dr.syntax
-def _trace_wavefront(
-    scene, sampler, max_depth, rr_depth, capacity, stored, rejected, position, word, flux
-):
+def _trace_wavefront(scene, source, sampler, options, store, reject):
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
-    capacity = dr.opaque(mi.UInt32, capacity)
-    max_depth, rr_depth = dr.opaque(mi.UInt32, max_depth), dr.opaque(mi.UInt32, rr_depth)
+    o = options
+    max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
     reach = dr.opaque(mi.Float, largest_coordinate(scene))
 
     # --- Leave the emitter ---
-    ray, emitted, _ = scene.sample_emitter_ray(
-        mi.Float(0), sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True
+    ray, emitted, emitter = source.sample_ray(
+        mi.Float(0),
+        sampler.next_1d(),
+        sampler.next_2d(),
+        sampler.next_2d(),
+        wavelengths=o.wavelengths,
     )
-    finite = dr.isfinite(dr.sum(emitted))
-    dr.scatter_add(rejected, mi.UInt32(1), mi.UInt32(0), ~finite)
+    finite = dr.all(dr.isfinite(emitted))
+    reject(~finite)
+    shortest = mi.UInt32(2)  # Segments of the shortest path that is stored
+    if dr.hint(o.unseen_light, mode="scalar"):
+        shortest = dr.select(only_photons_see(emitter), mi.UInt32(1), mi.UInt32(2))
     ray = mi.Ray3f(ray)  # Current ray
     β = mi.Spectrum(1)  # Path throughput, shading-normal corrections included
     η = mi.Float(1)  # Relative index of refraction along the path
     depth = mi.UInt32(1)  # Path segments up to the next vertex
+    caustic = mi.Bool(True)  # Walked parts of BSDFs only, so far
     active = finite & (dr.max(emitted) > 0)
 
-    while active:
+    while dr.hint(active, label="light paths"):
         # --- Find the next vertex ---
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
@@ -178,20 +266,19 @@ def _trace_wavefront(
         same_side = (dr.dot(-ray.d, si.n) * mi.Frame3f.cos_theta(si.wi)) > 0
 
         # --- Leave a photon ---
-        is_receiver, reflectance = receiver_reflectance(bsdf, si, active)
+        is_receiver, lambertian, _ = read_receiver(bsdf, si, o.roughness, o.general, active)
         power = emitted * β * (wi_s / wi_n)
-        deposit = active & is_receiver & same_side & (depth >= 2) & (dr.max(reflectance) > 0)
+        deposit = active & is_receiver & same_side & (depth >= shortest)
+        if dr.hint(o.caustics == "only", mode="scalar"):
+            deposit &= caustic
         finite = dr.all(dr.isfinite(power))
-        dr.scatter_add(rejected, mi.UInt32(1), mi.UInt32(0), deposit & ~finite)
+        reject(deposit & ~finite)
         deposit &= finite & (dr.max(power) > 0)
-        slot = dr.scatter_inc(stored, mi.UInt32(0), deposit)
-        deposit &= slot < capacity
         side = dr.mulsign(mi.Normal3f(si.n), dr.dot(-ray.d, si.n))
-        dr.scatter(position, si.p, slot, deposit)
-        dr.scatter(
-            word, encode_normal(side) | (dr.minimum(depth, mi.UInt32(255)) << 24), slot, deposit
-        )
-        dr.scatter(flux, _pack(power), slot, deposit)
+        word = encode_normal(side) | (dr.minimum(depth, SEGMENTS_MAX) << 24)
+        if dr.hint(o.caustics == "marked", mode="scalar"):
+            word |= dr.select(caustic, mi.UInt32(1 << 31), mi.UInt32(0))
+        store(si.p, word, power, -ray.d, deposit)
 
         # --- Scatter ---
         active &= depth < max_depth
@@ -205,8 +292,25 @@ def _trace_wavefront(
         correction = dr.abs((wi_s * wo_n) / (wo_s * wi_n))
         β *= weight * correction
         η *= bs.eta
+
+        # --- Which part of the BSDF was it? ---
+        if dr.hint(o.caustics != "ignored", mode="scalar"):
+            gathers = is_receiver
+            if dr.hint(o.general, mode="scalar"):
+                mixed = is_receiver & ~lambertian
+                smooth = mixed & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+                f_g = gathered_part(bsdf, si, bs.wo, o.roughness, smooth)
+                f = bsdf.eval(ctx, si, bs.wo, smooth)
+                g = dr.select(smooth & (f > 0), dr.clip(f_g / f, 0, 1), 0)
+                chance = dr.mean(g)
+                gathers = is_receiver & (lambertian | (sampler.next_1d(active) < chance))
+                part = dr.select(gathers, g / chance, (1 - g) / (1 - chance))
+                β = dr.select(mixed, β * part, β)
+            caustic &= ~gathers
+            if dr.hint(o.caustics == "only", mode="scalar"):
+                active &= caustic
         broken = active & ~dr.all(dr.isfinite(β))
-        dr.scatter_add(rejected, mi.UInt32(1), mi.UInt32(0), broken)
+        reject(broken)
         active &= ~broken & (dr.max(β) > 0)
 
         # --- Russian roulette, on the throughput alone: independent of the emitters' power ---

@@ -58,10 +58,13 @@ def automatic_radius(scene: Prepared, rays, seed: int) -> float:
     count = dr.width(rays)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(stream_seed(seed, PILOT, 1), count)
-    _, _, points = scene.walk(sampler, rays, mi.Bool(True))
+    _, _, points = scene.trace(sampler, rays)
+    if points is None:
+        return 0.01 * extent
+    count = dr.width(points.lane)
     radius = dr.full(mi.Float, _SMALLEST * extent, count)
-    looking = mi.Bool(points.active)
-    dr.eval(points, looking, radius)
+    looking = dr.full(mi.Bool, True, count)
+    dr.eval(looking, radius)
     for _ in range(_STEPS):
         disc = density.disc(points.n, radius)
         _, found = density.estimate(map_, points, disc, radius, scene.gather_depth, looking)
@@ -73,9 +76,6 @@ def automatic_radius(scene: Prepared, rays, seed: int) -> float:
         dr.eval(looking, radius)
         if not dr.any(looking):
             break
-    lanes = dr.compress(points.active)
-    if dr.width(lanes) == 0:
-        return 0.01 * extent
-    median = _weighted_median(dr.gather(mi.Float, radius, lanes).numpy())
+    median = _weighted_median(radius.numpy())
     more_photons = scene.settings.photon_count / pilot.settings.photon_count
     return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), _LARGEST * extent)

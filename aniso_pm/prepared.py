@@ -8,18 +8,30 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import density, eye, photons
+from . import density, emission, eye, photons
 from .needs import Needs, read_scene
 from .settings import Settings
 
 # Independent streams of random numbers.
-EYE, PROBE, PHOTONS, PILOT = range(4)
-# Longest path that a photon can tell from a longer one (see photons.segments).
-_SEGMENTS_MAX = 255
+EYE, PROBE, PHOTONS, PILOT, COLOUR = range(5)
 
 
 class Unsupported(ValueError):
     """The variant or the scene asks for something that this integrator does not do."""
+
+
+@dataclass(frozen=True)
+class Radiance:
+    """What one wavefront of eye paths saw.
+
+    L         radiance, W/m²/sr, per eye path.
+    valid     alpha is 1, per eye path.
+    gathered  density.Gathered of all gather points, a list: Lambertian receivers, other ones.
+    """
+
+    L: Any
+    valid: Any
+    gathered: list[density.Gathered]
 
 
 @dataclass(frozen=True)
@@ -30,6 +42,7 @@ class Prepared:
     needs: Needs
     settings: Settings
     hide_emitters: bool
+    emission: emission.Emission | None
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -51,79 +64,156 @@ class Prepared:
         return len(self.needs.chains) > 0
 
     @property
+    def use(self) -> str:
+        """How eye paths use the map; see ``eye``."""
+        return "final_gather" if self.settings.final_gather else self.settings.map
+
+    @property
+    def min_segments(self) -> int:
+        """Segments of the shortest light path in the map."""
+        return 1 if self.needs.unseen else 2
+
+    @property
+    def needs_map(self) -> bool:
+        """Is there anything for photons to do?"""
+        wanted = bool(self.needs.receivers) and self.settings.depth_limit > self.min_segments
+        caustics_only = self.use == "caustic" and not self.needs.unseen
+        return wanted and self.emission is not None and (self.deep or not caustics_only)
+
+    @property
+    def bytes_per_photon(self) -> int:
+        """Of a map at rest, index included: position and word, flux, direction, and one box of 32
+        bytes for every leaf and every inner node (2 nodes for 4 to 8 photons: 12 bytes)."""
+        return 16 + photons.flux_bytes() + (4 if self.needs.general else 0) + 12
+
+    @property
     def gather_depth(self) -> int:
         """The limit that ``density.estimate`` has to test photons against: none if there is no
         limit, or if all gather points lie at the first vertex and the map keeps the limit. Paths of
-        more than 255 segments are not told apart."""
+        more than ``photons.SEGMENTS_MAX`` segments are not told apart."""
         limit = self.settings.max_depth
-        return limit if self.deep and 0 < limit <= _SEGMENTS_MAX else 0
+        tested = self.deep or self.use != "global"
+        return limit if tested and 0 < limit <= photons.SEGMENTS_MAX else 0
 
-    def photon_map(self, seed: int, index: int, expected: int = 0) -> photons.PhotonMap:
-        """Photon map of pass ``index``; empty where nothing in the scene could use one."""
-        limit = self.settings.depth_limit
-        if limit < 3 or not self.needs.receivers or not self.scene.emitters():
-            return photons.PhotonMap(0, 0, 0, None, None)
-        return photons.build_map(
-            self.scene,
-            self.settings.photon_count,
-            stream_seed(seed, PHOTONS, index),
-            limit - 1,
-            self.settings.rr_depth,
-            expected,
+    def photon_map(
+        self, seed: int, index: int, expected: int = 0, wavelengths=None
+    ) -> photons.PhotonMap:
+        """Photon map of pass ``index``; empty where nothing in the scene could use one.
+
+        wavelengths: nm, of the photons, in spectral variants.
+        """
+        if not self.needs_map:
+            return photons.EMPTY
+        s = self.settings
+        options = photons.TraceOptions(
+            s.depth_limit - 1,
+            s.rr_depth,
+            {"global": "ignored", "final_gather": "marked", "caustic": "only"}[self.use],
+            bool(self.needs.general),
+            s.gather_roughness,
+            bool(self.needs.unseen),
+            wavelengths,
         )
+        seed = stream_seed(seed, PHOTONS, index)
+        return photons.build_map(self.scene, self.emission, s.photon_count, seed, options, expected)
 
-    def walk(self, sampler, ray, active):
-        """(radiance, valid, GatherPoints) of camera rays; see ``eye.walk``."""
-        return eye.walk(
-            self.scene,
-            sampler,
-            ray,
-            self.settings.depth_limit,
-            self.settings.rr_depth,
+    def trace(self, sampler, ray, expected: int = 0):
+        """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``."""
+        s = self.settings
+        options = eye.WalkOptions(
+            self.use,
+            s.depth_limit,
+            s.rr_depth,
+            self.min_segments,
             self.hide_emitters,
             self.follow_lobes,
             self.deep,
-            active,
+            bool(self.needs.general),
+            s.gather_roughness,
         )
+        return eye.trace(self.scene, sampler, ray, options, expected)
 
-    def gather(self, map_, radius, sampler, points) -> density.Gathered:
+    def gather(
+        self, map_, radius, seed: int, points: eye.GatherPoints, wavelengths=None
+    ) -> list[density.Gathered]:
         """Reflected radiance at gather points, edges compensated where that is asked for.
 
-        radius: bandwidth, world units; a Dr.Jit array, so that its value is no part of the kernel.
+        radius       bandwidth, world units; a Dr.Jit array, so that its value is no part of the
+                     kernel.
+        wavelengths  nm, of the eye paths, in spectral variants.
         """
+        if points.lambertian is None:
+            return [self._gather(map_, radius, seed, points, None)]
+        parts = []
+        for general in (False, True):
+            index = dr.compress(points.lambertian != general)
+            if dr.width(index):
+                some = eye.take(points, index)
+                surface = None
+                if general:
+                    roughness = self.settings.gather_roughness
+                    surface = density.Surface.at(self.scene, some, roughness, wavelengths)
+                parts.append(self._gather(map_, radius, seed, some, surface))
+        return parts
+
+    def _gather(self, map_, radius, seed, points, surface) -> density.Gathered:
         s = self.settings
         options = density.KernelOptions(
             self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
         )
         kernel, follows, degenerate = density.kernels(points, radius, options)
-        L, count = density.estimate(map_, points, kernel, radius, self.gather_depth, points.active)
+        L, count = density.estimate(
+            map_, points, kernel, radius, self.gather_depth, mi.Bool(True), surface
+        )
         lost = mi.Bool(False)
         if s.edge_compensation:
-            lit = points.active & (count > 0)
-            inverse, lost = density.probe_surface(self.scene, sampler, points, kernel, radius, lit)
+            inverse, lost = density.probe_surface(
+                self.scene, seed, points, kernel, radius, count > 0
+            )
             L *= inverse
         clamped, capped = follows & kernel.clamped, follows & kernel.capped
-        return density.Gathered(L, count, follows, clamped, capped, degenerate, lost)
+        found = density.Gathered(points.lane, L, count, follows, clamped, capped, degenerate, lost)
+        # One kernel for all of it: a reduction by itself would run the whole gather again.
+        dr.eval(found)
+        return found
+
+    def radiance(
+        self, sampler, ray, map_, radius, seed: int, expected: int = 0, lap=lambda stage: None
+    ) -> Radiance:
+        """Radiance along camera rays: their own share and the map's.
+
+        radius    bandwidth, world units: a Dr.Jit array.
+        seed      of the random numbers that density estimation takes.
+        expected  gather points to make room for.
+        lap       called with the name of each stage that ends.
+        """
+        L, valid, points = self.trace(sampler, ray, expected)
+        lap("eye")
+        gathered = []
+        if points is not None and map_.stored:
+            gathered = self.gather(map_, radius, seed, points, map_.wavelengths)
+            L = mi.Spectrum(L)
+            for found in gathered:
+                dr.scatter_add(L, found.radiance, found.lane)
+            dr.eval(L)
+        lap("gather")
+        return Radiance(L, valid, gathered)
 
 
 def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
     """Read the scene. Raises Unsupported with one sentence where it cannot be rendered."""
-    if mi.is_spectral:
-        raise Unsupported(
-            f'aniso_pm: variant "{mi.variant()}" is not supported (photons and eye paths would '
-            "have to share wavelengths); choose llvm_ad_rgb, llvm_ad_mono or their cuda_ twins"
-        )
     if mi.is_polarized:
         raise Unsupported(
             f'aniso_pm: variant "{mi.variant()}" is not supported (photons carry no '
             "polarisation); choose llvm_ad_rgb or another unpolarized variant"
         )
     try:
-        needs = read_scene(scene)
+        needs = read_scene(scene, settings.gather_roughness)
+        source = emission.prepare(scene) if scene.emitters() else None
     except ValueError as error:
         raise Unsupported(str(error)) from None
     _repair_bounds(scene)
-    prepared = Prepared(scene, needs, settings, hide_emitters)
+    prepared = Prepared(scene, needs, settings, hide_emitters, source)
     radius, extent = settings.initial_radius, prepared.extent
     if radius and scene.shapes() and not 1e-7 * extent <= radius <= 10 * extent:
         raise Unsupported(
@@ -154,4 +244,4 @@ def _repair_bounds(scene):
 
 def stream_seed(seed: int, stream: int, index: int = 0) -> int:
     """Seed of an independent stream of random numbers, by rounds of a block cipher (TEA)."""
-    return mi.sample_tea_32(mi.sample_tea_32(seed, 4 * index + stream)[0], 0x5EED)[0]
+    return mi.sample_tea_32(mi.sample_tea_32(seed, 8 * index + stream)[0], 0x5EED)[0]

@@ -16,12 +16,14 @@ import mitsuba as mi
 
 from . import film as films
 from .errors import is_interrupt
-from .eye import take_lanes
 from .pilot import automatic_radius, camera_rays
-from .prepared import EYE, PROBE, Prepared, stream_seed
+from .prepared import COLOUR, EYE, PROBE, Prepared, stream_seed
 
 # Eye samples traced at once: bounds memory (about 250 bytes a sample).
 WAVEFRONT = 1 << 21
+
+# Passes that make the colours of a spectral picture right within about a percent.
+_SPECTRAL_PASSES = 16
 
 
 def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
@@ -55,6 +57,12 @@ def render(scene: Prepared, sensor, seed: int, spp: int, report, statistics: dic
         )
     if not scene.scene.emitters():
         mi.Log(mi.LogLevel.Warn, "aniso_pm: the scene has no emitters; the picture will be black")
+    if mi.is_spectral and settings.passes < _SPECTRAL_PASSES:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"aniso_pm: all light of a pass shares four wavelengths; {settings.passes} passes will "
+            f'give wrong colours, set the parameter "passes" to {_SPECTRAL_PASSES} or more',
+        )
     film.prepare([])
     radius0 = settings.initial_radius or automatic_radius(scene, camera_rays(sensor, seed), seed)
     clock.lap("pilot")
@@ -82,13 +90,17 @@ def render(scene: Prepared, sensor, seed: int, spp: int, report, statistics: dic
     try:
         for i in range(settings.passes):
             radius = bandwidth(radius0, settings.alpha, i)
-            map_ = scene.photon_map(seed, i, map_.stored if map_ else 0)
+            colour = _wavelength_sample(seed, i)
+            wavelengths = films.wavelengths(sensor, colour) if mi.is_spectral else None
+            map_ = scene.photon_map(seed, i, map_.stored if map_ else 0, wavelengths)
             statistics["photons_emitted"] += map_.emitted
             statistics["photons_stored"] += map_.stored
             statistics["photons_rejected"] += map_.rejected
             clock.lap("photons")
             share = spp // settings.passes + (i < spp % settings.passes)
-            for done in _eye_pass(scene, sensor, map_, radius, seed, i, share, statistics, clock):
+            for done in _eye_pass(
+                scene, sensor, map_, radius, seed, i, share, colour, statistics, clock
+            ):
                 report(i + done / share, settings.passes, f"pass {i + 1}/{settings.passes}")
             statistics["radius"] = radius
             statistics["passes"] += 1
@@ -100,7 +112,15 @@ def render(scene: Prepared, sensor, seed: int, spp: int, report, statistics: dic
     return map_, radius
 
 
-def _eye_pass(scene: Prepared, sensor, map_, radius, seed, index, spp, statistics, clock):
+def _wavelength_sample(seed: int, index: int) -> float:
+    """Which wavelengths pass ``index`` takes: a van der Corput sequence from a random start. Each
+    sample stands for four wavelengths a quarter apart, so it needs to cover a quarter only."""
+    start = stream_seed(seed, COLOUR) / 2**32
+    sequence = int(f"{index:032b}"[::-1], 2) / 2**32
+    return (start + sequence / 4) % 1
+
+
+def _eye_pass(scene: Prepared, sensor, map_, radius, seed, index, spp, colour, statistics, clock):
     """Trace ``spp`` eye samples a pixel against one map, wavefront by wavefront; yields the
     samples a pixel taken so far."""
     film = sensor.film()
@@ -108,7 +128,7 @@ def _eye_pass(scene: Prepared, sensor, map_, radius, seed, index, spp, statistic
     per_wavefront = max(1, min(spp, WAVEFRONT // pixels))
     # An array, not a number: as a literal it would make every pass compile kernels of its own.
     radius = dr.opaque(mi.Float, radius)
-    taken = wavefront = 0
+    taken = wavefront = expected = 0
     while taken < spp:
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(min(per_wavefront, spp - taken))
@@ -117,37 +137,28 @@ def _eye_pass(scene: Prepared, sensor, map_, radius, seed, index, spp, statistic
         seed_ = mi.sample_tea_32(stream_seed(seed, EYE, index), wavefront)[0]
         sampler.seed(seed_, pixels * count)
 
-        # --- Eye paths ---
-        ray, ray_weight, position = films.sample_rays(sensor, sampler, count)
-        L, valid, points = scene.walk(sampler, ray, mi.Bool(True))
-        dr.eval(L, valid, points, ray_weight, position)
-        clock.lap("eye")
-
-        # --- Density estimation, for the lanes that have a gather point ---
-        lanes = dr.compress(points.active) if map_.stored else mi.UInt32()
-        if dr.width(lanes) > 0:
-            probes = mi.load_dict({"type": "independent"})
-            seed_ = mi.sample_tea_32(stream_seed(seed, PROBE, index), wavefront)[0]
-            probes.seed(seed_, dr.width(lanes))
-            found = scene.gather(map_, radius, probes, take_lanes(points, lanes))
-            gathered = dr.zeros(mi.Spectrum, dr.width(L))
-            dr.scatter(gathered, found.radiance, lanes)
-            # One kernel for all of it: a reduction by itself would run the whole gather again.
-            dr.eval(gathered, found)
-            L += gathered
-            statistics["gather_points"] += dr.width(lanes)
+        # --- Eye paths and density estimation ---
+        ray, ray_weight, position = films.sample_rays(sensor, sampler, count, colour)
+        dr.eval(ray, ray_weight, position)
+        probe_seed = mi.sample_tea_32(stream_seed(seed, PROBE, index), wavefront)[0]
+        seen = scene.radiance(sampler, ray, map_, radius, probe_seed, expected, clock.lap)
+        L = seen.L
+        for found in seen.gathered:
+            statistics["gather_points"] += dr.width(found.lane)
             statistics["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
             statistics["gather_points_clamped"] += int(dr.count(found.clamped)[0])
             statistics["gather_points_capped"] += int(dr.count(found.capped)[0])
             statistics["gather_points_degenerate"] += int(dr.count(found.degenerate)[0])
             statistics["gather_points_off_surface"] += int(dr.count(found.lost)[0])
             statistics["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
-        clock.lap("gather")
+        expected = sum(dr.width(found.lane) for found in seen.gathered)
 
         # --- Into the film ---
         finite = dr.all(dr.isfinite(L))
         statistics["eye_samples_rejected"] += dr.width(L) - int(dr.count(finite)[0])
-        films.splat(film, position, dr.select(finite, L, 0) * ray_weight, valid, count)
+        films.splat(
+            film, position, dr.select(finite, L, 0) * ray_weight, seen.valid, count, ray.wavelengths
+        )
         clock.lap("film")
         statistics["eye_samples"] += pixels * count
         statistics["spp"] += count

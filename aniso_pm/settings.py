@@ -22,6 +22,9 @@ class Settings:
     epsilon: float = 0.02
     guard: bool = True
     max_aspect: float = 32.0
+    map: str = "global"
+    final_gather: bool = False
+    gather_roughness: float = 0.2
     photon_count: int = 250_000
     passes: int = 1
     alpha: float = 2 / 3
@@ -48,6 +51,13 @@ class Settings:
         self._one_of("size", "bandwidth", "epsilon")
         self._between("epsilon", 1e-8, 10)
         self._between("max_aspect", 1, 1e4)
+        self._one_of("map", "global", "caustic")
+        if self.final_gather and self.map != "global":
+            raise ValueError(
+                f'aniso_pm: parameter "final_gather" needs the global map, but "map" is '
+                f'"{self.map}"; remove one of them'
+            )
+        self._between("gather_roughness", 0.01, 1e30)
         self._between("photon_count", 1, 2 * 10**8)
         self._between("passes", 1, 10**7)
         self._between("alpha", 0, 1, "above 0 and at most 1", self.alpha > 0)

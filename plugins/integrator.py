@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 from aniso_pm import progressive
 from aniso_pm.pilot import automatic_radius
-from aniso_pm.prepared import prepare
+from aniso_pm.prepared import Unsupported, prepare
 from aniso_pm.settings import Settings
 
 
@@ -56,6 +56,24 @@ class AnisoPhotonMapper:
        - |float|
        - Largest ratio of a kernel's axes, between 1 and 10,000. (Default: 32)
 
+     * - map
+       - |string|
+       - ``global``: all indirect light is read from the photon map at the first receiver.
+         ``caustic``: the map holds only light that reached a receiver over glass, mirrors and
+         glossy surfaces; the rest is path traced, and scenes without caustics have no map.
+         (Default: ``global``)
+
+     * - final_gather
+       - |bool|
+       - Read only caustics at the first receiver and everything at the second one: smoother than
+         ``map=global`` at the price of longer eye paths. (Default: |false|)
+
+     * - gather_roughness
+       - |float|
+       - Roughness alpha from which on a glossy surface is a receiver, with its BSDF evaluated for
+         every photon; below it paths go on. At least 0.01; a large number leaves receivers to
+         diffuse surfaces and components. (Default: 0.2)
+
      * - photon_count
        - |int|
        - Light paths per pass. (Default: 250000)
@@ -97,14 +115,18 @@ class AnisoPhotonMapper:
        - Hide directly visible emitters. (Default: |false|)
 
     Direct light comes from emitter sampling combined with BSDF sampling; everything that reaches a
-    Lambertian surface over two path segments or more comes from the photon map. Surfaces that are
-    not Lambertian are walked through by photons and eye paths, as a path tracer does.
+    receiver over two path segments or more comes from the photon map. Receivers are diffuse
+    surfaces, the diffuse part of ``plastic`` and ``roughplastic``, and surfaces whose roughness is
+    at least ``gather_roughness``. Photons and eye paths walk on all others, as ``path`` does.
 
     After ``render()`` the attribute ``statistics`` holds counts and timings. The attribute
     ``progress`` may be set to a function (done, total, text) that is called after each pass.
 
-    .. warning:: Participating media, the polarized and spectral variants and derivatives are
-       refused. The program :monosp:`mitsuba` cannot load plugins written in Python; use
+    In spectral variants all photons and eye paths of a pass share four wavelengths, stratified over
+    the passes: give at least 16 passes.
+
+    .. warning:: Participating media, polarized variants and derivatives are refused. The program
+       :monosp:`mitsuba` cannot load plugins written in Python; use
        :monosp:`aniso-pm render`.
 
     .. tabs::
@@ -141,8 +163,23 @@ class AnisoPhotonMapper:
         self.statistics: dict[str, Any] = {}
         self.progress: Callable[[float, int, str], None] | None = None
         self._last_map: tuple | None = None
+        self._exposed: dict[str, Any] = {}
 
     # --- Mitsuba's interface ---
+
+    def traverse(self, callback):
+        """Numbers and switches are reachable through ``mi.traverse``; the names of kernel, rule,
+        size and map change through the attribute ``settings``."""
+        for name, value in asdict(self.settings).items():
+            if not isinstance(value, str):
+                array = {bool: mi.Bool, int: mi.Int32, float: mi.Float}[type(value)]
+                self._exposed[name] = array(value)
+                callback.put(name, self._exposed[name], mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys):
+        """Take over what ``mi.traverse`` has changed; ValueError for a value out of range."""
+        changed = {name: self._exposed[name][0] for name in keys if name in self._exposed}
+        self.settings = self.settings.with_(**changed)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Render the scene; see ``mi.Integrator.render``. With several passes ``spp`` is their
@@ -173,14 +210,17 @@ class AnisoPhotonMapper:
         if left is None or left[0] is not scene:
             prepared = prepare(scene, self.settings, self.hide_emitters)
             seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
+            if mi.is_spectral:
+                raise Unsupported(
+                    "aniso_pm: in spectral variants this integrator cannot be sampled by another "
+                    "one that draws wavelengths of its own; render with it directly"
+                )
             radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
             left = (scene, prepared, prepared.photon_map(seed, 0), radius)
         _, prepared, map_, radius = left
-        L, valid, points = prepared.walk(sampler, ray, mi.Bool(active))
-        if map_.stored:
-            radius = dr.opaque(mi.Float, radius)
-            L += prepared.gather(map_, radius, sampler, points).radiance
-        return L, valid, []
+        seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
+        seen = prepared.radiance(sampler, ray, map_, dr.opaque(mi.Float, radius), seed)
+        return dr.select(active, seen.L, 0), seen.valid & active, []
 
     def aov_names(self):
         return []

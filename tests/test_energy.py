@@ -300,3 +300,75 @@ def test_kernel_normalisation_is_exact_on_a_curved_surface():
     image = mi.render(scene, spp=64)
     # 3e5 photons of equal flux over the sphere: 0.3 % in the mean over the part that is seen.
     assert np.array(image).mean() == pytest.approx(2, rel=0.01)
+
+
+@pytest.mark.parametrize("use", [{}, {"map": "caustic"}, {"final_gather": True}])
+def test_a_mirror_that_sees_a_caustic_of_a_point_light(use):
+    """Spot → mirror A → floor → mirror B → camera, which no path tracer finds. The light seems to
+    come from the spot's image S' = (−2, 1, 0) behind A, so that the floor at p has the radiance
+    ρ/π · I (S'_y) / |S' − p|³, and B shows the floor mirrored at z = −1."""
+    T = mi.ScalarTransform4f
+    mirror = {"type": "conductor"}  # reflects everything
+    size, albedo, intensity = 16, 0.5, 10.0
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 2,
+                "to_world": T().look_at([0.3, 0.5, 0.8], [0, 0, -2], [0, 1, 0]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": size,
+                    "height": size,
+                    "rfilter": {"type": "box"},
+                    "component_format": "float32",
+                },
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": T().rotate([1, 0, 0], -90).scale(3),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}},
+            },
+            "A": {
+                "type": "rectangle",
+                "to_world": T().translate([-1, 0.5, 0]).rotate([0, 1, 0], 90).scale(0.5),
+                "bsdf": mirror,
+            },
+            "B": {
+                "type": "rectangle",
+                "to_world": T().translate([0.1, 0.3, -1]).scale(0.3),
+                "bsdf": mirror,
+            },
+            "spot": {
+                "type": "spot",
+                "to_world": T().look_at([0, 1, 0], [-1, 0.5, 0], [0, 0, 1]),
+                "cutoff_angle": 20,
+                "beam_width": 20,
+                "intensity": {"type": "rgb", "value": intensity},
+            },
+        }
+    )
+    sensor = scene.sensors()[0]
+    lane = np.arange(size * size)
+    centre = mi.Point2f((lane % size + 0.5) / size, (lane // size + 0.5) / size)
+    ray, _ = sensor.sample_ray(0, 0.5, centre, mi.Point2f(0.5))
+    o, d = ray.o.numpy(), ray.d.numpy()
+    floor = o - d * (o[1] / d[1])  # seen in B: the floor's mirror image
+    floor[2] = -2 - floor[2]
+    distance = np.linalg.norm(np.array([[-2], [1], [0]]) - floor, axis=0)
+    expected = (albedo / np.pi * intensity / distance**3).reshape(size, size)
+
+    plugin = mi.load_dict(
+        {
+            "type": "aniso_pm",
+            "photon_count": 500_000,
+            "passes": 8,
+            "initial_radius": 0.02,
+            "alpha": 1.0,
+        }
+        | use
+    )
+    image = np.array(mi.render(scene, integrator=plugin, spp=64), dtype=np.float64)[..., 0]
+    assert image.mean() == pytest.approx(expected.mean(), rel=0.01)
+    np.testing.assert_allclose(image, expected, rtol=0.15)

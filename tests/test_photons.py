@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import photons
+from aniso_pm import emission, photons
 
 ALBEDO = 0.5
 UNLIMITED = 0xFFFFFFFE
@@ -39,6 +39,12 @@ def furnace(flip=False, **emitter):
     )
 
 
+def build(scene, count, seed, max_depth, rr_depth, expected=0, **options):
+    defaults = {"caustics": "ignored", "general": False, "roughness": 0.2, "unseen_light": False}
+    options = photons.TraceOptions(max_depth, rr_depth, **(defaults | options))
+    return photons.build_map(scene, emission.prepare(scene), count, seed, options, expected)
+
+
 def total_flux(map_):
     flux = photons.photon_flux(map_, dr.arange(mi.UInt32, map_.stored), mi.Bool(True))
     return dr.sum(mi.Float64(flux.x))[0] / map_.emitted
@@ -49,14 +55,14 @@ POWER = np.pi * 2 * (2 * 4 + 4 * 1 + 2 * 1)
 
 
 def test_stored_flux_is_the_geometric_series():
-    map_ = photons.build_map(furnace(), 100_000, 1, UNLIMITED, 5)
+    map_ = build(furnace(), 100_000, 1, UNLIMITED, 5)
     # Every path deposits POWER·(a geometric number of times): relative standard error 0.6 %.
     assert total_flux(map_) == pytest.approx(POWER * ALBEDO / (1 - ALBEDO), rel=0.02)
 
 
 @pytest.mark.parametrize("depth", [2, 3, 5])
 def test_max_depth_cuts_the_series(depth):
-    map_ = photons.build_map(furnace(), 100_000, 2, depth, 100)
+    map_ = build(furnace(), 100_000, 2, depth, 100)
     expected = POWER * sum(ALBEDO**j for j in range(1, depth))
     # Without Russian roulette every path deposits exactly this.
     assert total_flux(map_) == pytest.approx(expected, rel=1e-4)
@@ -66,20 +72,20 @@ def test_max_depth_cuts_the_series(depth):
 
 
 def test_direct_light_is_not_stored():
-    assert photons.build_map(furnace(), 1000, 3, 1, 5).stored == 0
+    assert build(furnace(), 1000, 3, 1, 5).stored == 0
 
 
 def test_a_buffer_that_is_too_small_grows_and_loses_nothing():
     scene = furnace()
-    roomy = photons.build_map(scene, 20_000, 4, 6, 100)
-    tight = photons.build_map(scene, 20_000, 4, 6, 100, expected=10)
+    roomy = build(scene, 20_000, 4, 6, 100)
+    tight = build(scene, 20_000, 4, 6, 100, expected=10)
     assert tight.stored == roomy.stored == 5 * 20_000
     assert total_flux(tight) == pytest.approx(total_flux(roomy), rel=1e-6)
 
 
 def test_wavefronts_together_equal_one(monkeypatch):
     monkeypatch.setattr(photons, "WAVEFRONT", 3000)
-    map_ = photons.build_map(furnace(), 10_000, 5, 4, 100)
+    map_ = build(furnace(), 10_000, 5, 4, 100)
     assert map_.stored == 3 * 10_000
     assert total_flux(map_) == pytest.approx(POWER * (0.5 + 0.25 + 0.125), rel=1e-4)
 
@@ -103,7 +109,7 @@ def test_nothing_is_stored_on_the_back_of_one_sided_surfaces():
             },
         }
     )
-    assert photons.build_map(scene, 10_000, 6, UNLIMITED, 5).stored == 0
+    assert build(scene, 10_000, 6, UNLIMITED, 5).stored == 0
 
 
 def test_photons_that_are_not_finite_are_dropped_and_counted():
@@ -146,7 +152,7 @@ def test_photons_that_are_not_finite_are_dropped_and_counted():
             },
         }
     )
-    map_ = photons.build_map(scene, 10_000, 7, 2, 5)
+    map_ = build(scene, 10_000, 7, 2, 5)
     assert map_.rejected > 1000
     assert abs(map_.stored - map_.rejected) < 6 * 100  # one half each
     assert np.isfinite(map_.flux.numpy()).all()
@@ -160,3 +166,28 @@ def test_normals_survive_their_encoding():
     v = mi.Vector3f(np.ascontiguousarray(n.T.astype(np.float32)))
     back = photons.decode_normal(photons.encode_normal(v) | (77 << 24)).numpy().T
     assert (back * n).sum(1).min() > np.cos(np.radians(0.07))  # 12 bits a coordinate
+
+
+def test_directions_survive_packing():
+    """32 bits octahedral: within 1e-4 rad in every direction."""
+    rng = np.random.default_rng(3)
+    v = rng.normal(size=(3, 10_000))
+    v /= np.linalg.norm(v, axis=0)
+    back = photons._decode(photons._encode(mi.Vector3f(v.astype(np.float32)), 16), 16).numpy()
+    assert np.linalg.norm(back - v, axis=0).max() < 1e-4
+
+
+def test_photons_are_shared_in_proportion_to_power():
+    """A lamp of 1 W and one of 99 W: the floor of 5 % is shared evenly, the rest by power. Flux is
+    divided by the chance, so their sum stays what it is."""
+    lamp = lambda power: {"type": "point", "intensity": power / (4 * np.pi)}  # noqa: E731
+    scene = mi.load_dict({"type": "scene", "a": lamp(1.0), "b": lamp(99.0)})
+    source = emission.prepare(scene)
+    count = 100_000
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, count)
+    u1, u2, u3 = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+    _, flux, _ = source.sample_ray(mi.Float(0), u1, u2, u3)
+    flux = flux.x.numpy()
+    assert np.mean(flux < 50) == pytest.approx(0.95 * 0.01 + 0.025, abs=0.003)
+    assert flux.mean() == pytest.approx(100, rel=0.01)

@@ -153,6 +153,8 @@ def random_scene(seed: int) -> tuple[dict, dict]:
         "epsilon": dice.log(1e-8, 10),
         "guard": dice.chance(0.5),
         "max_aspect": dice.log(1, 1e4),
+        "map": dice.one_of("global", "global", "caustic"),
+        "gather_roughness": dice.between(0.1, 1),
         "photon_count": int(dice.log(1, 20_000)),
         "passes": int(dice.rng.integers(1, 4)),
         "alpha": dice.between(0.01, 1),
@@ -162,6 +164,8 @@ def random_scene(seed: int) -> tuple[dict, dict]:
         "rr_depth": int(dice.rng.integers(1, 10)),
         "hide_emitters": dice.chance(0.3),
     }
+    if integrator["map"] == "global":
+        integrator["final_gather"] = dice.chance(0.3)
     return scene, integrator
 
 

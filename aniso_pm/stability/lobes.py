@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import drjit as dr
@@ -9,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 from aniso_pm import density
 from aniso_pm.asg import product
-from aniso_pm.eye import GatherPoints, LobeOnPath
 from aniso_pm.kernel import RULES, guarded_axes, kernel_axes
+from aniso_pm.lobe_path import LobeOnPath
 
 from . import reference as ref
 from .case import Case, Measured, worst_of
@@ -29,6 +30,7 @@ from .lanes import (
     vec,
     words,
 )
+from .sums import gather_points
 
 # Asked for: kernel axes within 1e-3 of the definition. Squared lengths: twice that.
 AXES = 1e-3
@@ -98,11 +100,8 @@ def _axes_behind(rule) -> Measured:
 def _kernel_behind(rule) -> Measured:
     """Behind the lobe the integrator takes the disc, and says so."""
     lobe, r = _behind()
-    count = len(r)
-    path = LobeOnPath(asg(lobe), vec(r), mi.Float(2), dr.full(mi.Bool, True, count))
-    points = GatherPoints(
-        path.valid, mi.Point3f(0), mi.Normal3f(vec(-r)), mi.Spectrum(1), mi.UInt32(2), path
-    )
+    path = LobeOnPath(asg(lobe), vec(r), mi.Float(2), mi.Float(0), dr.full(mi.Bool, True, len(r)))
+    points = replace(gather_points(np.zeros_like(r)), n=mi.Normal3f(vec(-r)), path=path)
     options = density.KernelOptions(True, rule, "bandwidth", EPSILON, True, 32.0)
     kernel, _, degenerate = density.kernels(points, mi.Float(0.1), options)
     lengths = [np.linalg.norm(arr(w), axis=1) for w in (kernel.s, kernel.t)]

@@ -24,18 +24,22 @@ def photon_map(position, power, emitted=1000) -> photons.PhotonMap:
     index = spatial.build(_points(position), dr.full(mi.UInt32, int(word[0]), count))
     wide = np.array(power, np.float32)[index.order.numpy()]
     width = 1 if dr.size_v(mi.Spectrum) == 1 else 4
-    return photons.PhotonMap(emitted, count, 0, index, mi.Float(np.repeat(wide, width)))
+    return photons.PhotonMap(emitted, count, 0, index, mi.Float(np.repeat(wide, width)), None, None)
 
 
 def gather_points(position) -> GatherPoints:
     count = len(position)
     return GatherPoints(
-        dr.full(mi.Bool, True, count),
-        _points(position),
-        mi.Normal3f(0, 0, 1),
-        mi.Spectrum(1),
-        dr.full(mi.UInt32, 1, count),
-        None,
+        lane=dr.arange(mi.UInt32, count),
+        p=_points(position),
+        n=mi.Normal3f(0, 0, 1),
+        weight=mi.Spectrum(1),
+        depth=dr.full(mi.UInt32, 1, count),
+        path=None,
+        origin=None,
+        d=None,
+        lambertian=None,
+        caustic=None,
     )
 
 
@@ -48,7 +52,8 @@ def estimate(map_, at, radius):
     radius = dr.opaque(mi.Float, radius)
     disc = kernel.disc(mi.Normal3f(0, 0, 1), radius)
     points = gather_points(at)
-    value, count = density.estimate(map_, points, disc, radius, 0, points.active)
+    active = dr.full(mi.Bool, True, len(at))
+    value, count = density.estimate(map_, points, disc, radius, 0, active)
     return np.array(value[0], np.float64), np.array(count)
 
 

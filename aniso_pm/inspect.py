@@ -1,0 +1,115 @@
+"""What a scene needs of the integrator, what was left out, and why (``aniso-pm inspect``)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .needs import emitter_name
+from .prepared import Prepared
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One decision: is the part traced and stored, what follows, and the evidence for it."""
+
+    name: str
+    needed: bool
+    consequence: str
+    evidence: list[str]
+
+
+def examine(scene: Prepared) -> list[Finding]:
+    """All decisions that were taken for a scene and its integrator's parameters."""
+    needs, settings = scene.needs, scene.settings
+    shown = scene.follow_lobes
+    why_disc = "parameter kernel=isotropic" if settings.kernel == "isotropic" else "none found"
+    mirrors = [e for e in needs.chains if e not in needs.general] or needs.chains
+    emitters = [emitter_name(e) for e in scene.scene.emitters()]
+    spectrum = f"{dr.size_v(mi.Spectrum)} channels of the variant {mi.variant()}"
+    return [
+        Finding(
+            "photon map",
+            scene.needs_map,
+            f"{scene.use}: photons are traced and gathered"
+            if scene.needs_map
+            else "no photon is traced: the scene is path traced",
+            needs.receivers or ["no surface gathers"],
+        ),
+        Finding(
+            "caustics, specular chains",
+            scene.deep,
+            "eye paths walk on to deeper gather points" if scene.deep else "eye paths end at once",
+            mirrors or ["only Lambertian surfaces"],
+        ),
+        Finding(
+            "anisotropic lobes",
+            shown,
+            f"lobes are followed, kernels by rule={settings.rule}"
+            if shown
+            else "all kernels discs",
+            needs.lobes if shown else [why_disc],
+        ),
+        Finding(
+            "unreadable roughness",
+            bool(needs.unreadable),
+            "kernels behind these surfaces are discs" if needs.unreadable else "none",
+            needs.unreadable,
+        ),
+        Finding(
+            "general receivers",
+            bool(needs.general),
+            "photons keep directions; the BSDF is evaluated for each"
+            if needs.general
+            else "no directions are stored, one BRDF value a gather point",
+            needs.general or ["all receivers are Lambertian"],
+        ),
+        Finding(
+            "light only photons find",
+            bool(needs.unseen),
+            "direct light of these is stored too" if needs.unseen else "direct light is not stored",
+            needs.unseen,
+        ),
+        Finding(
+            "choice of emitters",
+            scene.emission is not None and scene.emission.choose is not None,
+            "light paths are shared by power" if len(emitters) > 1 else "nothing to choose",
+            emitters or ["the scene has no emitters"],
+        ),
+        Finding(
+            "path length of photons",
+            scene.gather_depth > 0,
+            "tested at every gather"
+            if scene.gather_depth
+            else "not tested: no limit, or the map keeps it",
+            [f"max_depth={settings.max_depth}"],
+        ),
+        Finding(
+            "edge compensation",
+            settings.edge_compensation and scene.needs_map,
+            "short rays measure how much of each kernel lies on the surface",
+            [f"edge_compensation={str(settings.edge_compensation).lower()}"],
+        ),
+        Finding(
+            "bytes per photon",
+            scene.needs_map,
+            f"{scene.bytes_per_photon} with its index" if scene.needs_map else "0",
+            [spectrum],
+        ),
+    ]
+
+
+def as_text(findings: list[Finding]) -> str:
+    lines = []
+    for f in findings:
+        lines.append(f"{'yes' if f.needed else 'no ':3s}  {f.name:26s} {f.consequence}")
+        shown = f.evidence[:6] + ([f"… and {len(f.evidence) - 6} more"] if f.evidence[6:] else [])
+        lines += [f"{'':33s}{e}" for e in shown]
+    return "\n".join(lines)
+
+
+def as_data(findings: list[Finding]) -> list[dict[str, Any]]:
+    return [asdict(f) for f in findings]

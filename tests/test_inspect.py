@@ -1,0 +1,87 @@
+"""What is found out about a scene, and what is left out because of it."""
+
+import json
+
+import matrix
+import mitsuba as mi
+import pytest
+from aniso_pm import cli, inspect
+from aniso_pm.prepared import prepare
+from aniso_pm.settings import Settings
+
+
+@pytest.fixture(autouse=True)
+def _variant(variant_llvm_rgb):
+    pass
+
+
+def findings(name, **settings):
+    scene = matrix.make(matrix.rows()[name], size=4)
+    return {f.name: f for f in inspect.examine(prepare(scene, Settings(**settings), False))}
+
+
+def test_a_diffuse_room_needs_nothing_but_the_map():
+    found = findings("area, diffuse")
+    assert [name for name, f in found.items() if f.needed] == [
+        "photon map",
+        "edge compensation",
+        "bytes per photon",
+    ]
+
+
+def test_without_caustics_a_caustic_map_is_no_map():
+    found = findings("area, diffuse", map="caustic")
+    assert not found["photon map"].needed and "path traced" in found["photon map"].consequence
+    scene = matrix.make(matrix.rows()["area, diffuse"], size=4)
+    integrator = mi.load_dict({"type": "aniso_pm", "map": "caustic"})
+    mi.render(scene, integrator=integrator, spp=1)
+    assert integrator.statistics["photons_emitted"] == 0
+
+
+def test_evidence_names_shape_and_nested_bsdfs():
+    found = findings("brushed conductor")
+    assert found["anisotropic lobes"].evidence == ["plate: TwoSidedBRDF(RoughConductor)"]
+    found = findings("brushed conductor", kernel="isotropic")
+    assert not found["anisotropic lobes"].needed
+    assert found["anisotropic lobes"].evidence == ["parameter kernel=isotropic"]
+
+
+@pytest.mark.parametrize(
+    "row, general",
+    [
+        ("roughconductor 0.4", True),
+        ("roughconductor 0.1", False),
+        ("roughplastic 0.1", True),  # its diffuse component
+        ("principled", True),
+        ("dielectric", False),
+        ("hair", False),
+        ("textured roughness", True),
+        ("mask of diffuse", True),
+    ],
+)
+def test_receivers_are_what_is_rough_or_diffuse(row, general):
+    assert findings(row)["general receivers"].needed == general
+
+
+def test_roughness_that_cannot_be_read_is_named():
+    assert findings("hair")["unreadable roughness"].evidence == ["ball: Hair"]
+
+
+def test_the_threshold_is_a_parameter():
+    assert not findings("roughconductor 0.4", gather_roughness=0.5)["general receivers"].needed
+    assert findings("roughconductor 0.1", gather_roughness=0.05)["general receivers"].needed
+
+
+def test_the_command_prints_the_same_as_text_and_json(tmp_path, capsys):
+    scene = tmp_path / "s.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><sensor type="perspective"/><integrator type="aniso_pm"/>'
+        '<emitter type="point"/><shape type="sphere" id="s"><bsdf type="plastic"/></shape></scene>'
+    )
+    assert cli.main(["inspect", str(scene), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert {"name", "needed", "consequence", "evidence"} == set(told[0])
+    assert cli.main(["inspect", str(scene)]) == 0
+    text = capsys.readouterr().out
+    assert "s: SmoothPlastic" in text and "PointLight" in text
+    assert cli.main(["inspect", str(tmp_path / "none.xml")]) == 2
