@@ -53,7 +53,7 @@ class TangentDerivatives(NamedTuple):
     """First and second derivatives of ln G in a tangent basis (e1, e2) at a direction v.
 
     e1, e2 are the ASG's axes x, y turned to v by the smallest rotation that takes z to v.
-    g1, g2: gradient, 1/rad. h11, h12, h22: Hessian, 1/rad². front: v·z > 0.
+    g1, g2: gradient, 1/rad. h11, h12, h22: Hessian, 1/rad². All in double precision.
     """
 
     e1: Any
@@ -63,7 +63,6 @@ class TangentDerivatives(NamedTuple):
     h11: Any
     h12: Any
     h22: Any
-    front: Any
 
 
 @dataclass
@@ -105,39 +104,39 @@ class ASG:
         return dr.select(s > 0, f, -dr.inf)
 
     def tangent_derivatives(self, v) -> TangentDerivatives:
-        """Gradient and Hessian of ln G at v in the turned lobe axes.
+        """Gradient and Hessian of ln G at v in the turned lobe axes, in double precision.
 
-        Everything is computed from a, b, s alone, so the result is as accurate as those three.
+        The curvature of G along the long axis is a difference f'' + (g·d)² of terms as large as
+        the squared gradient, 1e10 and more for narrow lobes; single precision loses it where it
+        changes sign. Nothing here assumes that the axes are orthogonal to more than rounding.
         Behind the lobe (v·z <= 0) all derivatives are 0; for 0 < v·z < 1e-9 they are those of
         v·z = 1e-9.
         """
-        a, b, s = self._local(v)
+        wide = dr.float64_array_t(mi.Vector3f)
+        x, y, z = wide(self.x), wide(self.y), wide(self.z)
+        lam, mu = 2 * type(x.x)(self.lam), 2 * type(x.x)(self.mu)
+        v = dr.normalize(wide(mi.Vector3f(v)))
+        a, b, s = dr.dot(v, x), dr.dot(v, y), dr.dot(v, z)
         front = s > 0
         s = dr.maximum(s, S_MIN)
-        # Rotation z → v applied to x and y, in world space and in the lobe's coordinates.
-        k = dr.rcp(1 + s)
-        half = self.z + mi.Vector3f(v)
-        e1, e2 = self.x - half * (a * k), self.y - half * (b * k)
-        e1x, e1y, e1z = 1 - a * a * k, -a * b * k, -a
-        e2x, e2y, e2z = e1y, 1 - b * b * k, -b
+        # The smallest rotation z → v applied to x; e2 is on the side of y, mirrored frames too.
+        e1 = x - (z + v) * (a / (1 + s))
+        e1 = dr.normalize(e1 - v * dr.dot(e1, v))
+        e2 = dr.cross(v, e1)
+        e2 = dr.mulsign(e2, dr.dot(e2, y - (z + v) * (b / (1 + s))))
 
-        la, mb, inv_s = 2 * self.lam * a, 2 * self.mu * b, dr.rcp(s)
-        bend = 1 - la * a - mb * b  # ∇f·v
+        inv_s = dr.rcp(s)
+        p, q = ((dr.dot(e, x), dr.dot(e, y), dr.dot(e, z) * inv_s) for e in (e1, e2))
+        bend = 1 - lam * a * a - mu * b * b  # ∇f·v
 
-        def hessian(px, py, pz, qx, qy, qz):
-            radial = (pz * inv_s) * (qz * inv_s)
-            return -radial - 2 * self.lam * px * qx - 2 * self.mu * py * qy
+        def slope(p):
+            return dr.select(front, p[2] - lam * a * p[0] - mu * b * p[1], 0)
 
-        zero = mi.Float(0)
+        def hessian(p, q, bend):
+            return dr.select(front, -p[2] * q[2] - lam * p[0] * q[0] - mu * p[1] * q[1] - bend, 0)
+
         return TangentDerivatives(
-            e1,
-            e2,
-            dr.select(front, e1z * inv_s - la * e1x - mb * e1y, zero),
-            dr.select(front, e2z * inv_s - la * e2x - mb * e2y, zero),
-            dr.select(front, hessian(e1x, e1y, e1z, e1x, e1y, e1z) - bend, zero),
-            dr.select(front, hessian(e1x, e1y, e1z, e2x, e2y, e2z), zero),
-            dr.select(front, hessian(e2x, e2y, e2z, e2x, e2y, e2z) - bend, zero),
-            front,
+            e1, e2, slope(p), slope(q), hessian(p, p, bend), hessian(p, q, 0), hessian(q, q, bend)
         )
 
     def log_gradient(self, v):
@@ -146,7 +145,7 @@ class ASG:
         This is g/G of paper step 2, with its misprint (G·r)r read as (∇G·r)r.
         """
         t = self.tangent_derivatives(v)
-        return t.e1 * t.g1 + t.e2 * t.g2
+        return mi.Vector3f(t.e1 * t.g1 + t.e2 * t.g2)
 
     def log_second_derivative(self, v, d):
         """Second derivative of ln G at v along the geodesic that leaves v in the unit tangent

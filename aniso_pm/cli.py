@@ -292,6 +292,48 @@ def inspect(
 
 
 @app.command()
+def stability(
+    out: Annotated[Path, typer.Option("--output", "-o", help="Directory to write into.")],
+    variant: Annotated[str, typer.Option("--variant", "-m", help="Variant.")] = "llvm_ad_rgb",
+    quick: Annotated[bool, typer.Option("--quick", help="Leave out the slow cases.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the record instead of the table.")
+    ] = False,
+) -> int:
+    """Measure extreme cases against 50-digit references and write the table.
+
+    Writes stability.json, stability.html and stability.md. Exit status 1 if a case fails.
+    """
+    try:
+        import jinja2  # noqa: F401
+        import mpmath  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            f"this needs {error.name}, which is not installed: pip install 'aniso-pm[stability]'"
+        ) from error
+    _make_directory(out)
+    _set_variant(variant)
+
+    from aniso_pm.doctor import versions
+    from aniso_pm.stability import all_cases, case, page
+
+    rows = []
+    with _mitsuba_log(quiet=True):
+        for row in case.run(all_cases(), quick):
+            rows.append(row)
+            if not as_json:
+                print(page.line(row), flush=True)
+    about = {"versions": versions(), "variant": variant, "quick": quick}
+    found = page.record(rows, about)
+    paths = page.write(out, found)
+    if as_json:
+        print(json.dumps(found, indent=2, ensure_ascii=False))
+    else:
+        print(f"{page.summary(found['counts'])}; written: {', '.join(map(str, paths))}")
+    return int(found["counts"][case.FAIL] > 0)
+
+
+@app.command()
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
 ) -> int:
@@ -301,6 +343,14 @@ def doctor(
     checks = examination.examine()
     print(examination.as_json(checks) if as_json else examination.as_text(checks))
     return int(any(check.fix for check in checks))
+
+
+def _make_directory(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write into '{path}': {error.strerror or error}") from error
+    output.check_writable(path / "stability.json")
 
 
 def _parse_defines(pairs: list[str]) -> dict[str, str]:

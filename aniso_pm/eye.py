@@ -23,6 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .lobe_path import LobeOnPath, follow, no_lobe
+from .rays import largest_coordinate, spawn_ray
 from .receivers import gathered_part, read_receiver
 
 
@@ -175,6 +176,7 @@ def _walk(scene, sampler, ray, options, push):
     ctx = mi.BSDFContext()
     o = options
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
+    reach = dr.opaque(mi.Float, largest_coordinate(scene))
 
     ray = mi.Ray3f(ray)  # Current ray
     lane = dr.arange(mi.UInt32, dr.width(ray))
@@ -247,7 +249,7 @@ def _walk(scene, sampler, ray, options, push):
         if dr.hint(o.follow_lobes, mode="scalar"):
             path = follow(path, bsdf, si, ray, bs, active & ~(dr.min(g) == 1))
         valid |= on_surface & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        ray = si.spawn_ray(si.to_world(bs.wo))
+        ray = spawn_ray(si, si.to_world(bs.wo), reach)
         β_direct = β * weight
         if dr.hint(o.use == "global", mode="scalar"):
             β = β_direct * (1 - g)

@@ -163,8 +163,10 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active):
         while (node != 0) & (leaf == 0):
             low = dr.gather(mi.Vector4f, boxes, 2 * node)
             high = dr.gather(mi.Vector4f, boxes, 2 * node + 1)
-            half = 0.5 * mi.Vector3f(high.x - low.x, high.y - low.y, high.z - low.z)
-            mid = mi.Vector3f(low.x, low.y, low.z) + half - center
+            # Relative to the centre first: far from the origin a box's middle is not a number.
+            low = mi.Point3f(low.x, low.y, low.z) - center
+            high = mi.Point3f(high.x, high.y, high.z) - center
+            mid, half = 0.5 * (high + low), 0.5 * (high - low)
             da = dr.maximum(dr.abs(dr.dot(a, mid)) - dr.dot(abs_a, half), 0)
             db = dr.maximum(dr.abs(dr.dot(b, mid)) - dr.dot(abs_b, half), 0)
             dc = dr.abs(dr.dot(c, mid)) - dr.dot(abs_c, half)

@@ -39,6 +39,8 @@ from .warp import symmetric_eigen
 RULES = ("taylor", "paper", "lobe")
 # Share of the disc that the guard adds, in units of the bandwidth (κ above).
 GUARD_KAPPA = 1.0
+# Smallest |r·n| that a projection divides by.
+COS_MIN = 1e-3
 
 
 def kernel_axes(lobe: ASG, r, epsilon=0.02, rule="taylor"):
@@ -56,26 +58,26 @@ def kernel_axes(lobe: ASG, r, epsilon=0.02, rule="taylor"):
     if rule not in RULES:
         raise ValueError(f'kernel_axes: rule "{rule}" is not one of {", ".join(RULES)}')
     t = lobe.tangent_derivatives(r)
-    epsilon = mi.Float(epsilon)
+    # In double precision like the derivatives; only the result is rounded.
+    wide = type(t.g1)
+    epsilon = wide(mi.Float(epsilon))
     if rule == "lobe":
-        tiny = 1e-12
-        u = t.e1 * dr.sqrt(epsilon / dr.maximum(lobe.lam, tiny))
-        v = t.e2 * dr.sqrt(epsilon / dr.maximum(lobe.mu, tiny))
-        return u, v
+        lam, mu = (dr.maximum(wide(w), 1e-12) for w in (lobe.lam, lobe.mu))
+        u, v = t.e1 * dr.sqrt(epsilon / lam), t.e2 * dr.sqrt(epsilon / mu)
+        return mi.Vector3f(u), mi.Vector3f(v)
 
-    cos_t, sin_t, mixed, high = _steep_direction(t, epsilon)
+    # Floors at the size of rounding of the two derivatives: they keep the lengths finite and are
+    # not reached elsewhere.
+    floor_g = 1e-14 * (2 * wide(dr.maximum(lobe.lam, lobe.mu)) + 1)
+    floor_k = 1e-7
+    cos_t, sin_t = _steep_direction(t, epsilon)
     if rule == "paper":
         # Along g itself wherever there is a gradient to speak of.
-        norm = dr.hypot(t.g1, t.g2)
-        has_gradient = norm > 1e-6 * dr.sqrt(2 * dr.maximum(lobe.lam, lobe.mu) + 1)
+        norm = dr.sqrt(t.g1 * t.g1 + t.g2 * t.g2)
+        has_gradient = norm > floor_g
         inv = dr.rcp(dr.select(has_gradient, norm, 1))
         cos_t = dr.select(has_gradient, t.g1 * inv, cos_t)
         sin_t = dr.select(has_gradient, t.g2 * inv, sin_t)
-
-    # Floors at the size of single-precision rounding of the two derivatives: they keep the
-    # lengths finite and are not reached elsewhere.
-    scale = 2 * dr.maximum(lobe.lam, lobe.mu) + 1
-    floor_g, floor_k = 1e-7 * dr.sqrt(scale), 1e-7
 
     def curvature(c, s, slope):
         second = t.h11 * c * c + 2 * t.h12 * c * s + t.h22 * s * s
@@ -88,48 +90,27 @@ def kernel_axes(lobe: ASG, r, epsilon=0.02, rule="taylor"):
     else:
 
         def taylor_length(slope, kappa):
-            # (g·d)² + 2ε|κ| as a hypotenuse: the squares may leave the single-precision range.
-            return 2 * epsilon / (slope + _hypot(slope, dr.sqrt(2 * epsilon) * dr.sqrt(kappa)))
+            return 2 * epsilon / (slope + dr.sqrt(slope * slope + 2 * epsilon * kappa))
 
         slope_v = dr.abs(t.g2 * cos_t - t.g1 * sin_t)
-        # Far from the centre v is almost perpendicular to g and this product all rounding. There
-        # the eigenvectors' own condition uᵀ(g gᵀ + ε|H|/2)v = 0 gives g·v without cancellation.
-        small = (slope_v < 0.1 * slope_u) & (slope_u * slope_u > epsilon * high)
-        exact = 0.5 * epsilon * dr.abs(mixed) / dr.select(small, slope_u, 1)
-        slope_v = dr.select(small, exact, slope_v)
         length_u = taylor_length(slope_u, curvature(cos_t, sin_t, slope_u))
         length_v = taylor_length(slope_v, curvature(-sin_t, cos_t, slope_v))
 
-    u_d = t.e1 * cos_t + t.e2 * sin_t
-    v_d = t.e2 * cos_t - t.e1 * sin_t  # r × u_d
-    return u_d * length_u, v_d * length_v
+    u = (t.e1 * cos_t + t.e2 * sin_t) * length_u
+    v = (t.e2 * cos_t - t.e1 * sin_t) * length_v  # along r × u
+    return mi.Vector3f(u), mi.Vector3f(v)
 
 
 def _steep_direction(t, epsilon):
-    """(cos, sin, uᵀ|H|v, ‖H‖): coordinates in (e1, e2) of the dominant eigenvector u of
-    g gᵀ + ε|H|/2, |H| the Hessian with its eigenvalues made positive; |H|'s mixed entry, v = r × u,
-    and its larger eigenvalue."""
+    """(cos, sin): the dominant eigenvector of g gᵀ + ε|H|/2 in (e1, e2), |H| being the Hessian
+    with its eigenvalues made positive."""
     high, low, c, s = symmetric_eigen(t.h11, t.h12, t.h22)
-    high, low = dr.abs(high), dr.abs(low)
-    difference, largest = high - low, dr.maximum(high, low)
-    # All terms scaled by the largest entry, so that no square overflows.
-    size = dr.maximum(dr.maximum(dr.abs(t.g1), dr.abs(t.g2)), dr.sqrt(largest))
-    inv = dr.rcp(dr.select(size > 0, size, 1))
-    g1, g2 = t.g1 * inv, t.g2 * inv
-    weight = 0.5 * epsilon * inv
-    high, low = high * weight * inv, low * weight * inv
-    m11 = g1 * g1 + high * c * c + low * s * s
-    m12 = g1 * g2 + (high - low) * c * s
-    m22 = g2 * g2 + high * s * s + low * c * c
+    high, low = (0.5 * epsilon * dr.abs(w) for w in (high, low))
+    m11 = t.g1 * t.g1 + high * c * c + low * s * s
+    m12 = t.g1 * t.g2 + (high - low) * c * s
+    m22 = t.g2 * t.g2 + high * s * s + low * c * c
     _, _, cos_t, sin_t = symmetric_eigen(m11, m12, m22)
-    mixed = difference * (cos_t * c + sin_t * s) * (cos_t * s - sin_t * c)
-    return cos_t, sin_t, mixed, largest
-
-
-def _hypot(a, b):
-    big, small = dr.maximum(a, b), dr.minimum(a, b)
-    ratio = small / dr.select(big > 0, big, 1)
-    return big * dr.sqrt(1 + ratio * ratio)
+    return cos_t, sin_t
 
 
 def project_to_plane(u, v, r, n, distance):
@@ -163,18 +144,20 @@ class PlaneKernel:
     """Elliptical Gaussian on a plane: exp(−(d·s)²/|s|⁴ − (d·t)²/|t|⁴) with s ⟂ t.
 
     s, t     orthogonal half axes, world units, |s| >= |t|.
-    bounded  the aspect cap or the grazing clamp acted on this lane.
+    clamped  the plane is seen edge-on: |r·n| < COS_MIN was raised to it.
+    capped   the aspect cap shortened the long axis.
     """
 
     s: Any
     t: Any
-    bounded: Any
+    clamped: Any
+    capped: Any
 
 
 def disc(n, radius) -> PlaneKernel:
     """The isotropic kernel of the same area: |s| = |t| = radius."""
     frame = mi.Frame3f(n)
-    return PlaneKernel(frame.s * radius, frame.t * radius, mi.Bool(False))
+    return PlaneKernel(frame.s * radius, frame.t * radius, mi.Bool(False), mi.Bool(False))
 
 
 def guarded_axes(
@@ -184,7 +167,7 @@ def guarded_axes(
 
     Ellipses are added and bounded as covariance matrices in an orthonormal basis of the plane, so
     that neither a degenerate parallelogram (s ∥ t) nor an edge-on plane needs a case of its own:
-    1/|r·n| is clamped at 1e3 and what the clamp or the cap max_aspect changed is reported.
+    |r·n| is clamped at COS_MIN, and where the clamp or the cap max_aspect acted is reported.
 
     lobe, r, n in one frame (world); distance, radius in world units. size="bandwidth" scales the
     ellipse to |s × t| = radius²; "epsilon" keeps the literal size of the rule.
@@ -209,8 +192,8 @@ def guarded_axes(
 
     # --- Projection along r, in the plane's basis ---
     cos_n = dr.dot(r, n)
-    grazing = dr.abs(cos_n) < 1e-3
-    inv = dr.mulsign(dr.rcp(dr.maximum(dr.abs(cos_n), 1e-3)), cos_n)
+    clamped = dr.abs(cos_n) < COS_MIN
+    inv = dr.mulsign(dr.rcp(dr.maximum(dr.abs(cos_n), COS_MIN)), cos_n)
     r1, r2 = dr.dot(r, frame.s), dr.dot(r, frame.t)
 
     def project(w):
@@ -243,4 +226,4 @@ def guarded_axes(
     long, short = mean * stretch, mean / stretch
     s = (frame.s * cos_t + frame.t * sin_t) * long
     t = (frame.t * cos_t - frame.s * sin_t) * short
-    return PlaneKernel(s, t, capped | grazing)
+    return PlaneKernel(s, t, clamped, capped)

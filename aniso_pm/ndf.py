@@ -21,6 +21,8 @@ import mitsuba as mi
 
 from .asg import ASG
 
+# Smallest roughness of Mitsuba's microfacet distributions: bandwidths are at most 1e8.
+ALPHA_MIN = 1e-4
 _CURVATURE_FACTOR = {"beckmann": 1.0, "ggx": 2.0}
 
 
@@ -90,17 +92,21 @@ def nested_bsdfs(found: dict) -> list:
 
 def own_roughness(bsdf):
     """How to read the roughness of a BSDF by itself: a function of (si, active) that returns
-    (alpha_u, alpha_v), or None where it has none that can be read (wrappers have none)."""
+    (alpha_u, alpha_v), or None where it has none that can be read (wrappers have none). Roughness
+    is at least 1e-4, as in Mitsuba's own distributions."""
     found = children(bsdf)
 
     def value(name, si, active):
         source = found[name]
         return source.eval_1(si, active) if isinstance(source, mi.Texture) else mi.Float(source)
 
+    def alpha(name, si, active):
+        return dr.maximum(value(name, si, active), ALPHA_MIN)
+
     if "alpha_u" in found and "alpha_v" in found:
-        return lambda si, active: (value("alpha_u", si, active), value("alpha_v", si, active))
+        return lambda si, active: (alpha("alpha_u", si, active), alpha("alpha_v", si, active))
     if "alpha" in found:
-        return lambda si, active: (value("alpha", si, active),) * 2
+        return lambda si, active: (alpha("alpha", si, active),) * 2
     if "roughness" in found and ("spec_tint" in found or "anisotropic" in found):
         # Mitsuba's principled BSDFs, after Burley (2012).
         def principled(si, active):

@@ -28,6 +28,7 @@ import mitsuba as mi
 
 from . import index as spatial
 from .emission import Emission, only_photons_see
+from .rays import largest_coordinate, spawn_ray
 from .receivers import gathered_part, read_receiver
 
 # Light paths traced at once: bounds the memory of a wavefront, not the number of photons.
@@ -243,6 +244,7 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
     o = options
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
+    reach = dr.opaque(mi.Float, largest_coordinate(scene))
 
     # --- Leave the emitter ---
     ray, emitted, emitter = source.sample_ray(
@@ -327,7 +329,7 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
         active &= ~roulette | (sampler.next_1d(active) < survive)
         β[roulette] = β * dr.rcp(survive)
 
-        ray = si.spawn_ray(wo)
+        ray = spawn_ray(si, wo, reach)
         depth += 1
 
 

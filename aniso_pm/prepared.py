@@ -187,7 +187,7 @@ class Prepared:
         options = density.KernelOptions(
             self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
         )
-        kernel, follows = density.kernels(points, radius, options)
+        kernel, follows, degenerate = density.kernels(points, radius, options)
         L, count = density.estimate(
             map_, points, kernel, radius, self.gather_depth, mi.Bool(True), surface
         )
@@ -197,7 +197,8 @@ class Prepared:
                 self.scene, seed, points, kernel, radius, count > 0
             )
             L *= inverse
-        found = density.Gathered(points.lane, L, count, follows, follows & kernel.bounded, lost)
+        clamped, capped = follows & kernel.clamped, follows & kernel.capped
+        found = density.Gathered(points.lane, L, count, follows, clamped, capped, degenerate, lost)
         # One kernel for all of it: a reduction by itself would run the whole gather again.
         dr.eval(found)
         return found

@@ -42,7 +42,9 @@ _COUNTS = (
     "eye_samples_rejected",
     "gather_points",
     "gather_points_anisotropic",
-    "gather_points_bounded",
+    "gather_points_clamped",
+    "gather_points_capped",
+    "gather_points_degenerate",
     "gather_points_off_surface",
     "spp",
 )
@@ -305,7 +307,9 @@ class _Run:
             for found in seen.gathered:
                 counts["gather_points"] += dr.width(found.lane)
                 counts["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
-                counts["gather_points_bounded"] += int(dr.count(found.bounded)[0])
+                counts["gather_points_clamped"] += int(dr.count(found.clamped)[0])
+                counts["gather_points_capped"] += int(dr.count(found.capped)[0])
+                counts["gather_points_degenerate"] += int(dr.count(found.degenerate)[0])
                 counts["gather_points_off_surface"] += int(dr.count(found.lost)[0])
                 counts["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
             self.points.seen(sum(dr.width(found.lane) for found in seen.gathered))

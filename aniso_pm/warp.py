@@ -32,34 +32,42 @@ def warp_to_reflection(ndf: ASG, o) -> ASG:
     The result is centred at the mirror direction; its amplitude is that of ``ndf``, and 0 where
     o·n <= 0. The Jacobian 1/(4 o·h) of the density is not part of it (paper: part of the smooth M).
     """
-    o = mi.Vector3f(o)
-    n = ndf.z
+    # In double precision: an axis at an aspect of 1e4 moves by 1e-3 of the other one's length when
+    # its direction is off by 1e-7. Only the result is rounded.
+    wide = dr.float64_array_t(mi.Vector3f)
+    o, x, y, n = wide(mi.Vector3f(o)), wide(ndf.x), wide(ndf.y), wide(ndf.z)
+    lam, mu = type(o.x)(ndf.lam), type(o.x)(ndf.mu)
     c = dr.dot(o, n)
     visible = c > 0
     c_safe = dr.maximum(dr.abs(c), COS_MIN)
     i = dr.normalize(2 * c * n - o)
 
-    # X' is across the plane of incidence. Within 1e-4 rad of normal incidence any tangent serves
-    # (the form is isotropic there up to 1e-8); it is made orthogonal to i in either case.
+    # X' is across the plane of incidence. Within 1e-12 rad of normal incidence any tangent serves;
+    # it is made orthogonal to i in either case.
     across = dr.cross(o, n)
-    x_ = dr.select(dr.squared_norm(across) > 1e-8, across, ndf.x)
-    x_ = dr.normalize(dr.fma(-dr.dot(x_, i), i, x_))
+    x_ = dr.select(dr.squared_norm(across) > 1e-24, across, x)
+    x_ = dr.normalize(x_ - i * dr.dot(x_, i))
     y_ = dr.cross(i, x_)
 
-    cos_phi, sin_phi = dr.dot(ndf.x, x_), dr.dot(ndf.y, x_)
+    cos_phi, sin_phi = dr.dot(x, x_), dr.dot(y, x_)
     cc, ss, cs = cos_phi * cos_phi, sin_phi * sin_phi, cos_phi * sin_phi
     k = 0.5 * dr.rcp(c_safe)
-    m11 = (ndf.lam * cc + ndf.mu * ss) * k * k
-    m12 = 0.5 * (ndf.mu - ndf.lam) * cs * k
-    m22 = (ndf.mu * cc + ndf.lam * ss) * 0.25
+    m11 = (lam * cc + mu * ss) * k * k
+    m12 = 0.5 * (mu - lam) * cs * k
+    m22 = (mu * cc + lam * ss) * 0.25
 
     major, minor, cos_t, sin_t = symmetric_eigen(m11, m12, m22)
-    x = x_ * cos_t + y_ * sin_t
-    y = y_ * cos_t - x_ * sin_t
     # The smaller eigenvalue is a difference; det/major keeps its relative accuracy. The
     # determinant is λμ/(16c²) identically.
-    minor = dr.select(major > 0, (ndf.lam / major) * ndf.mu * (0.25 * k * k), minor)
-    return ASG(x, y, i, major, minor, dr.select(visible, ndf.amplitude, 0))
+    minor = dr.select(major > 0, (lam / major) * mu * (0.25 * k * k), minor)
+    return ASG(
+        x_ * cos_t + y_ * sin_t,
+        y_ * cos_t - x_ * sin_t,
+        i,
+        major,
+        minor,
+        dr.select(visible, ndf.amplitude, 0),
+    )
 
 
 def symmetric_eigen(m11, m12, m22):

@@ -11,6 +11,16 @@ from aniso_pm.ndf import asg_from_roughness, children
 
 # Smallest and largest roughness; values outside are clamped, as in Mitsuba's own microfacet BSDFs.
 ALPHA_MIN, ALPHA_MAX = 1e-4, 1.0
+# Numbers that the parameters may be, (low, high, in words): textures and spectra by their mean.
+# Fresnel's formula takes the fourth power of eta and k.
+RANGES = {
+    "alpha": (0.0, ALPHA_MAX, f"above 0 and at most {ALPHA_MAX:g}"),
+    "alpha_u": (0.0, ALPHA_MAX, f"above 0 and at most {ALPHA_MAX:g}"),
+    "alpha_v": (0.0, ALPHA_MAX, f"above 0 and at most {ALPHA_MAX:g}"),
+    "eta": (0.0, 1e6, "between 0 and 1e+06"),
+    "k": (0.0, 1e6, "between 0 and 1e+06"),
+    "specular_reflectance": (0.0, 1.0, "between 0 and 1"),
+}
 
 
 class ASGConductor:
@@ -62,14 +72,15 @@ class ASGConductor:
             )
         if ("alpha_u" in props) != ("alpha_v" in props):
             raise ValueError('asgconductor: "alpha_u" and "alpha_v" must be given together')
-        for name in ("alpha", "alpha_u", "alpha_v"):
-            _check_alpha(name, props[name] if name in props else 0.1)
+        for name in RANGES:
+            if name in props:
+                _check(name, props[name])
 
         if "eta" in props:
             self.eta = props.get_unbounded_texture("eta")
             self.k = props.get_unbounded_texture("k")
         else:
-            self.eta, self.k = _named_conductor(str(props.get("material", "Cu")))
+            self.eta, self.k = _named_conductor(props["material"] if "material" in props else "Cu")
         if "alpha_u" in props:
             self.alpha_u = props.get_texture("alpha_u")
             self.alpha_v = props.get_texture("alpha_v")
@@ -211,17 +222,36 @@ def _named_conductor(material):
         # Mitsuba's convention for a reflectance of 1.
         constant = lambda v: mi.load_dict({"type": "uniform", "value": v})  # noqa: E731
         return constant(0.0), constant(1.0)
+    if type(material) is not str:
+        raise ValueError(
+            f'asgconductor: parameter "material" is {material!r}; it must be a name, such as "Cu"'
+        )
     try:
         twin = mi.load_dict({"type": "roughconductor", "material": material})
     except RuntimeError:
-        raise ValueError(f'asgconductor: unknown material "{material}"') from None
+        raise ValueError(
+            f'asgconductor: parameter "material" is "{material}", which is unknown; it must be one '
+            'of the conductors that roughconductor knows ("Ag", "Al", "Au", "Cu", …), or "none"'
+        ) from None
     found = children(twin)
     return found["eta"], found["k"]
 
 
-def _check_alpha(name, value):
-    if isinstance(value, (int, float)) and not (math.isfinite(value) and 0 < value <= ALPHA_MAX):
+def _check(name, value):
+    """Raise ValueError unless the number, or the mean of the texture, is in range."""
+    low, high, words = RANGES[name]
+    mean = value
+    if isinstance(value, mi.Texture):
+        try:
+            mean = float(mi.Float(value.mean())[0])
+        except RuntimeError:  # a texture that does not know its mean
+            return
+    elif type(value) not in (int, float):
         raise ValueError(
-            f'asgconductor: parameter "{name}" is {value}; it must be above 0 and at most '
-            f"{ALPHA_MAX:g}"
+            f'asgconductor: parameter "{name}" is {value!r}; it must be a number {words}, a '
+            "spectrum or a texture"
         )
+    # A texture may be 0 in places: roughness is clamped there. A number may not.
+    above = mean > low or mean == low and (not name.startswith("alpha") or mean is not value)
+    if not (math.isfinite(mean) and above and mean <= high):
+        raise ValueError(f'asgconductor: parameter "{name}" is {mean:g}; it must be {words}')

@@ -173,6 +173,12 @@ class AnisoPhotonMapper:
     """
 
     def __init__(self, props):
+        # Mitsuba's own complaint names neither the value nor what it may be.
+        if "hide_emitters" in props and type(props["hide_emitters"]) is not bool:
+            raise TypeError(
+                'aniso_pm: parameter "hide_emitters" must be of type boolean, '
+                f"got {props['hide_emitters']!r}"
+            )
         mi.SamplingIntegrator.__init__(self, props)
         for name in ("timeout", "samples_per_pass", "block_size"):
             if name in props:

@@ -43,17 +43,18 @@ def measure(name, seeds, spp):
         f"\n{name}: {seeds} seeds, {spp} spp, {mask.mean():.0%} of the pixels show metal; ", end=""
     )
     print(f"variance of the reference {np.mean(weight * noise[mask] ** 2):.1e}\n")
-    print("| kernel | rule | guard | variance | bias² | energy, indirect | bounded |")
+    print("| kernel | rule | guard | variance | bias² | energy, indirect | fallbacks |")
     print("|---|---|---|---|---|---|---|")
     isotropic = None
     for kernel, rule, guard in KERNELS:
         parameters = {"kernel": kernel, "rule": rule, "guard": guard}
-        images, bounded = [], 0.0
+        images, fallbacks = [], 0.0
         for seed in range(seeds):
             image, plugin = render(scene, base | parameters, spp, seed)
             images.append(image[mask])
             counts = plugin.statistics
-            bounded = counts["gather_points_bounded"] / max(1, counts["gather_points_anisotropic"])
+            acted = sum(counts[f"gather_points_{k}"] for k in ("clamped", "capped", "degenerate"))
+            fallbacks = acted / max(1, counts["gather_points"])
         half = seeds // 2
         a, b = np.mean(images[:half], axis=0), np.mean(images[half:], axis=0)
         energy = np.array([i.mean() for i in images]) - direct
@@ -65,7 +66,7 @@ def measure(name, seeds, spp):
             f"| {('on' if guard else 'off') if kernel != 'isotropic' else '–'} "
             f"| {np.mean(weight * np.var(images, axis=0, ddof=1)):.4f} "
             f"| {np.mean(weight * (a - first) * (b - second)):.5f} "
-            f"| {ratios.mean():.4f} ± {spread:.4f} | {bounded:.1%} |",
+            f"| {ratios.mean():.4f} ± {spread:.4f} | {fallbacks:.1%} |",
             flush=True,
         )
 

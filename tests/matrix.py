@@ -35,7 +35,7 @@ class Row:
     drop       shapes of the room left out.
     reference  integrator that converges on it.
     spp        samples per pixel of a reference render.
-    differs    how far Mitsuba's own integrators differ there, if they do (a share).
+    whole      compare all light, not the indirect light alone.
     """
 
     light: str = "area"
@@ -43,7 +43,7 @@ class Row:
     drop: tuple = ()
     reference: str = "path"
     spp: int = 4096
-    differs: float = 0.0
+    whole: bool = False
 
 
 def T():
@@ -225,7 +225,7 @@ def rows():
         "projector, diffuse": Row("projector", block(diffuse)),
         "directional, diffuse": Row("directional", block(diffuse)),
         "directionalarea, diffuse": Row(
-            "directionalarea", block(diffuse), reference="ptracer", spp=65536
+            "directionalarea", block(diffuse), reference="ptracer", spp=2048, whole=True
         ),
         "constant, diffuse": Row("constant", block(diffuse)),
         "envmap, diffuse": Row("envmap", block(diffuse)),
@@ -371,9 +371,15 @@ def make(row, size=SIZE):
     return mi.load_dict(scene | light | row.objects)
 
 
-def mean_and_error(scene, integrator, spp, seeds):
+def mean_and_error(row, integrator, spp, seeds):
     """Mean of the indirect light over the image, and its standard error over the seeds."""
-    values = [indirect(scene, integrator, -1, spp, seed).mean() for seed in seeds]
+    scene = make(row)
+    if row.whole:
+        plugin = mi.load_dict(integrator)
+        images = (mi.render(scene, integrator=plugin, spp=spp, seed=seed) for seed in seeds)
+        values = [np.array(image, dtype=np.float64).mean() for image in images]
+    else:
+        values = [indirect(scene, integrator, -1, spp, seed).mean() for seed in seeds]
     return float(np.mean(values)), float(np.std(values, ddof=1) / len(values) ** 0.5)
 
 
@@ -381,7 +387,7 @@ def compare(row, use, expected, seeds=range(5), passes=4, share=8):
     """(ratio of our energy to the reference's, standard error of both together). We take 1/share
     of the reference's samples per pixel."""
     integrator = PHOTON_MAPPER | USES[use] | {"passes": passes}
-    mean, error = mean_and_error(make(row), integrator, max(row.spp // share, passes), seeds)
+    mean, error = mean_and_error(row, integrator, max(row.spp // share, passes), seeds)
     return mean / expected[0], math.hypot(error, expected[1]) / expected[0]
 
 
@@ -403,7 +409,7 @@ def main():
             print(f"{name:38s}", *(f"{r:.4f} ± {e:.4f}" for r, e in results.values()), flush=True)
             continue
         mean, error = mean_and_error(
-            make(row), {"type": row.reference, "rr_depth": 16}, row.spp, range(1000, 1008)
+            row, {"type": row.reference, "rr_depth": 16}, row.spp, range(1000, 1008)
         )
         known[name] = [float(f"{mean:.6g}"), float(f"{error:.3g}")]
         print(f"{name:38s}", known[name], f"{error / mean:.2%}", flush=True)

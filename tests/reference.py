@@ -1,5 +1,5 @@
 """What the modules should compute, written a second time from the formulas in double precision
-(numpy, whole arrays) and in 40 digits (mpmath, one case at a time).
+(numpy, whole arrays).
 
 All inputs are float64 arrays whose values are float32 numbers: the references see what the modules
 see, so that a difference is the module's and not the rounding of its inputs.
@@ -14,10 +14,18 @@ import aniso_pm  # before drjit and mitsuba: it chooses their LLVM
 # isort: split
 import mitsuba as mi
 import numpy as np
-from mpmath import mp, mpf
 
-mp.dps = 40
-
+# The references in 50 digits, one lobe at a time, are those of `aniso-pm stability`.
+from aniso_pm.stability.reference import (  # noqa: F401
+    floats,
+    mp_cross,
+    mp_dot,
+    mp_geodesic_differences,
+    mp_log_g,
+    mp_taylor_axes,
+    mp_unit,
+    mp_vec,
+)
 
 # --- Between numpy, Dr.Jit and mpmath ------------------------------------------------------------
 
@@ -211,76 +219,3 @@ def relative_difference(m, reference):
     whiten = q / np.sqrt(values)[..., None, :]
     difference = np.swapaxes(whiten, -1, -2) @ (m - reference) @ whiten
     return np.abs(np.linalg.eigvalsh(0.5 * (difference + np.swapaxes(difference, -1, -2)))).max(-1)
-
-
-# --- The same in 40 digits, one lobe at a time ---------------------------------------------------
-
-
-def mp_vec(a):
-    return mp.matrix([mpf(float(c)) for c in np.asarray(a).reshape(3)])
-
-
-def mp_dot(a, b):
-    return sum(a[i] * b[i] for i in range(3))
-
-
-def mp_unit(a):
-    return a / mp.sqrt(mp_dot(a, a))
-
-
-def mp_cross(a, b):
-    return mp.matrix(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
-
-
-def mp_log_g(lobe, i):
-    """v → ln G of the i-th lobe; v unit."""
-    x, y, z = mp_vec(lobe.x[i]), mp_vec(lobe.y[i]), mp_vec(lobe.z[i])
-    lam, mu = mpf(float(lobe.lam[i])), mpf(float(lobe.mu[i]))
-    return lambda v: mp.log(mp_dot(v, z)) - lam * mp_dot(v, x) ** 2 - mu * mp_dot(v, y) ** 2
-
-
-def mp_geodesic_differences(function, v, d, step):
-    """First and second central difference of `function` along v cos t + d sin t at t = 0.
-    v, d are made exactly orthonormal. With 40 digits and a step of 1e-9 standard deviations both
-    truncation (1e-18) and rounding (1e-22) are below double precision."""
-    v = mp_unit(v)
-    d = mp_unit(d - v * mp_dot(d, v))
-    step = mpf(step)
-    cosine, sine = mp.cos(step), mp.sin(step)
-    plus, zero, minus = (
-        function(v * cosine + d * sine),
-        function(v),
-        function(v * cosine - d * sine),
-    )
-    return (plus - minus) / (2 * step), (plus - 2 * zero + minus) / step**2
-
-
-def mp_taylor_axes(lobe, i, r, epsilon):
-    """The rule "taylor" with derivatives by finite differences of ln G and G along geodesics:
-    shares nothing with the closed forms. Returns u, v (numpy)."""
-    function = mp_log_g(lobe, i)
-    r, epsilon = mp_unit(mp_vec(r)), mpf(float(np.float32(epsilon)))
-    step = mpf("1e-9") / mp.sqrt(2 * float(max(lobe.lam[i], lobe.mu[i])) + 2)
-    helper = mp.matrix([1, 0, 0]) if abs(r[0]) < 0.6 else mp.matrix([0, 1, 0])
-    e = mp_unit(mp_cross(r, helper))
-    f = mp_cross(r, e)
-    g1, h11 = mp_geodesic_differences(function, r, e, step)
-    g2, h22 = mp_geodesic_differences(function, r, f, step)
-    _, mixed = mp_geodesic_differences(function, r, e + f, step)
-    h12 = mixed - (h11 + h22) / 2
-    values, q = mp.eigsy(mp.matrix([[h11, h12], [h12, h22]]))
-    positive = q * mp.diag([abs(values[0]), abs(values[1])]) * q.T
-    g = mp.matrix([g1, g2])
-    _, q = mp.eigsy(g * g.T / epsilon**2 + positive / (2 * epsilon))
-    axes = []
-    centre = function(r)
-    for k in (1, 0):
-        d = e * q[0, k] + f * q[1, k]
-        slope = abs(mp_geodesic_differences(function, r, d, step)[0])
-        # (∂²G/∂d²)/G from G itself, relative to its value at r.
-        _, curvature = mp_geodesic_differences(lambda w: mp.exp(function(w) - centre), r, d, step)
-        length = 2 * epsilon / (slope + mp.sqrt(slope**2 + 2 * epsilon * abs(curvature)))
-        axes.append(np.array([float(c) for c in d * length]))
-    return axes

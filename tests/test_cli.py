@@ -232,6 +232,9 @@ def test_header_and_json_tell_how_the_picture_was_made(run, scene):
     assert written == {key: told[key] for key in written}
     assert told["parameters"]["photon_count"] == header["aniso_pm.parameters.photon_count"] == 20000
     assert told["parameters"]["passes"] == 2 and told["seed"] == 7 and told["statistics"]
+    for fallback in ("clamped", "capped", "degenerate", "off_surface"):
+        count = header[f"aniso_pm.statistics.gather_points_{fallback}"]
+        assert 0 <= count <= header["aniso_pm.statistics.gather_points"]
 
 
 # --- Passes ---

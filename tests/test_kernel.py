@@ -17,7 +17,7 @@ from aniso_pm.kernel import (
     kernel_axes,
     project_to_plane,
 )
-from mpmath import mp, mpf
+from aniso_pm.stability.reference import mp, mpf
 from reference import arr, asg, dot, f32, flt, unit, vec
 
 EPSILON = float(np.float32(0.02))
@@ -66,10 +66,13 @@ def test_double_precision_taylor_axes_agree_with_mpmath_finite_differences():
     r = ref.directions(rng, lobe, np.concatenate([np.zeros(30), rng.uniform(0, 8, n - 30)]))
     u, v, *_ = ref.taylor_axes(lobe, r, EPSILON)
     found = squared(u, v, unit(r))
-    exact = np.array([ref.mp_taylor_axes(lobe, i, r[i], 0.02) for i in range(n)])
+    exact = (ref.mp_taylor_axes(lobe, i, r[i], 0.02) for i in range(n))
+    exact = np.array([[ref.floats(axis) for axis in pair] for pair in exact])
     wanted = squared(exact[:, 0], exact[:, 1], unit(r))
-    # Double precision with aspects up to 1e4 and κ near 0.
-    assert np.max(ref.relative_difference(found, wanted)) < 1e-6
+    # Double precision with κ near 0; comparing the ellipses costs roundings times aspect².
+    aspect = np.divide(*lengths(v, u))
+    assert np.median(aspect) < 1000  # 1e-9
+    assert np.max(ref.relative_difference(found, wanted) / (1e-8 + 1e-15 * aspect**2)) < 1
 
 
 @pytest.mark.parametrize("sigmas", [0.0, 1e-3, 0.1, 0.5, 2.0, 6.0, 12.0])
@@ -523,7 +526,7 @@ def test_aspect_cap_shortens_the_long_axis_keeps_the_area_and_says_so():
     assert np.mean(aspect > 4) > 0.2
     np.testing.assert_allclose(held, np.minimum(aspect, 4), rtol=1e-3)
     clear = np.abs(aspect / 4 - 1) > 1e-3
-    np.testing.assert_array_equal(np.array(capped.bounded)[clear], (aspect > 4)[clear])
+    np.testing.assert_array_equal(np.array(capped.capped)[clear], (aspect > 4)[clear])
     np.testing.assert_allclose(
         np.linalg.norm(np.cross(arr(capped.s), arr(capped.t)), axis=-1), 1e-8, rtol=1e-5
     )
@@ -553,7 +556,7 @@ def test_guarded_kernel_is_finite_for_edge_on_planes_and_degenerate_lobes(rule, 
     s, t = arr(kernel.s), arr(kernel.t)
     assert np.all(np.isfinite(s)) and np.all(np.isfinite(t))
     assert np.all(np.linalg.norm(t, axis=-1) > 0)
-    assert np.all(np.array(kernel.bounded)[:4])
+    assert np.all(np.array(kernel.clamped)[:4])
     assert np.max(np.divide(*lengths(s, t))) < 32 * (1 + 1e-5)
 
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm.ndf import asg_from_roughness
-from mpmath import mp, mpf
+from aniso_pm.stability.reference import mp, mpf
 from reference import arr, f32
 
 
