@@ -292,7 +292,7 @@ def test_the_command_line_replaces_the_scene_s_stopping_rules(run, scene):
     _, stdout, _ = run("render", path, "-o", "a.exr", "--target-error", "0.5", "--json")
     assert json.loads(stdout)["statistics"]["passes"] == 4
     _, stdout, _ = run("render", path, "-o", "a.exr", "--time", "0.001", "--json")
-    assert json.loads(stdout)["statistics"]["passes"] == 1
+    assert json.loads(stdout)["statistics"]["passes"] in (1, 2)  # compilation is not counted
 
 
 def test_a_damaged_or_foreign_state_is_refused_in_one_line(run, scene, tmp_path):
