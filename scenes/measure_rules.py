@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from make_pictures import HERE, SCENES, read_reference, render
+from measure_convergence import weights
 
 KERNELS = [("isotropic", "lobe", True)] + [
     ("anisotropic", rule, guard) for rule in ("lobe", "taylor", "paper") for guard in (True, False)
@@ -36,7 +37,8 @@ def measure(name, seeds, spp):
     mask = metal_pixels(scene)
     reference, noise = read_reference(name)
     first, second = ((reference + k * noise)[mask] for k in (1, -1))
-    weight = 1 / (reference[mask] ** 2 + 0.01)
+    # Not 1/(R² + 0.01) of the same noisy pixel: its error would weigh itself.
+    weight = weights((reference + noise, reference - noise))[mask]
     base = {"type": "aniso_pm", "photon_count": 100_000}
     direct = [render(scene, base | {"max_depth": 2}, spp, s)[0][mask].mean() for s in range(seeds)]
     print(
