@@ -175,8 +175,8 @@ class Surface:
         """BRDF value (1/sr) towards the viewer for light from a world-space direction."""
         wo = self.si.to_local(direction)
         value = gathered_part(self.bsdf, self.si, wo, self.roughness, active)
-        # Photons of a curved surface may come from just below this tangent plane: no value there.
-        return dr.select(value != 0, value / dr.abs(mi.Frame3f.cos_theta(wo)), 0)
+        # Bump maps keep their value where this cosine vanishes: no more than a hundredfold.
+        return value / dr.maximum(dr.abs(mi.Frame3f.cos_theta(wo)), 0.01)
 
 
 @dr.syntax

@@ -6,7 +6,8 @@ estimate. Emitter e is therefore chosen with probability
     p_e = (1 − F) P_e s_e / Σ P s + F / n,
 
 P_e its power from a small pilot, s_e Mitsuba's ``sampling_weight``, F = 0.05: the floor keeps every
-emitter in play if the pilot underrates it. Any p > 0 gives the right energy.
+emitter in play if the pilot underrates it. Any p > 0 gives the right energy. Delta emitters of
+weight 0 are left out, because nothing else finds them either: ``path`` does not see them.
 
 In spectral variants photons and eye paths must carry the same wavelengths λ, while Mitsuba's
 emitters draw wavelengths λ' of their own: flux = g L(λ')/p(λ'), g the geometric part. Emitters
@@ -112,14 +113,12 @@ def prepare(scene) -> Emission:
         if mi.is_spectral and kind == "Projector":
             raise ValueError(
                 f'aniso_pm: emitter "{emitter.id()}" is a projector, whose light cannot be '
-                "evaluated at given wavelengths; use an RGB variant, or a spot with a texture"
+                "evaluated at given wavelengths; use an RGB variant"
             )
     emitters = scene.emitters_dr()
     count = dr.width(emitters)
     varying = int(mi.EmitterFlags.Surface) | int(mi.EmitterFlags.SpatiallyVarying)
     textured = any((e.flags() & varying) == varying for e in scene.emitters())
-    if count == 1:
-        return Emission(scene, emitters, None, textured)
     lane = dr.arange(mi.UInt32, count * _PILOT_RAYS)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(_PILOT_SEED, count * _PILOT_RAYS)
@@ -129,11 +128,14 @@ def prepare(scene) -> Emission:
     )
     flux = dr.mean(flux)
     flux = dr.select(dr.isfinite(flux), flux, 0)
-    weight = dr.gather(mi.EmitterPtr, emitters, dr.arange(mi.UInt32, count)).sampling_weight()
-    power = dr.block_sum(flux, _PILOT_RAYS).numpy().astype(np.float64) * mi.Float(weight).numpy()
-    total = power.sum()
-    share = power / total if total > 0 else np.full(count, 1 / count)
-    chances = (1 - _FLOOR) * share + _FLOOR / count
+    weight = np.array([e.sampling_weight() for e in scene.emitters()])
+    delta = np.array([mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in scene.emitters()])
+    seen = ~delta | (weight > 0)
+    if count == 1:
+        return Emission(scene, emitters, None, textured)
+    power = dr.block_sum(flux, _PILOT_RAYS).numpy().astype(np.float64) * weight
+    share = power / power.sum() if power.sum() > 0 else seen / seen.sum()
+    chances = (1 - _FLOOR) * share + _FLOOR * seen / seen.sum()
     choose = mi.DiscreteDistribution(mi.Float(chances.astype(np.float32)))
     return Emission(scene, emitters, choose, textured)
 

@@ -230,6 +230,7 @@ def _walk(scene, sampler, ray, options, push):
         weight = dr.select(lambertian, β * brdf, β)
         here = is_receiver & (depth + o.min_segments <= max_depth)
         finite = dr.all(dr.isfinite(weight))
+        here &= dr.max(weight) != 0
         L[here & ~finite] = dr.nan  # counted and dropped later
         if dr.hint(o.follow_lobes, mode="scalar"):
             path.distance += dr.select(active, si.t, 0)
@@ -245,6 +246,7 @@ def _walk(scene, sampler, ray, options, push):
             f_g = gathered_part(bsdf, si, bs.wo, o.roughness, mixed & ~delta)
             f = bsdf.eval(ctx, si, bs.wo, mixed & ~delta)
             share = dr.select(f > 0, dr.clip(f_g / f, 0, 1), 0)
+            share = dr.select(share > 1 - 1e-5, 1, share)  # rounding leaves nothing to walk on
             g = dr.select(mixed, dr.select(delta, 0, share), g)
         if dr.hint(o.follow_lobes, mode="scalar"):
             path = follow(path, bsdf, si, ray, bs, active & ~(dr.min(g) == 1))
@@ -271,7 +273,7 @@ def _walk(scene, sampler, ray, options, push):
 
         # --- Russian roulette, for paths that go on ---
         if dr.hint(o.deep or o.use != "global", mode="scalar"):
-            survive = dr.minimum(dr.max(β) * η * η, 0.95)
+            survive = dr.minimum(dr.maximum(dr.max(β), dr.max(β_direct)) * η * η, 0.95)
             roulette = (depth >= rr_depth) & (dr.max(β) > 0)
             active &= ~roulette | (sampler.next_1d(active) < survive)
             scale = dr.select(roulette, dr.rcp(survive), 1)

@@ -97,8 +97,7 @@ def own_roughness(bsdf):
     found = children(bsdf)
 
     def value(name, si, active):
-        source = found[name]
-        return source.eval_1(si, active) if isinstance(source, mi.Texture) else mi.Float(source)
+        return _value(found[name], si, active)
 
     def alpha(name, si, active):
         return dr.maximum(value(name, si, active), ALPHA_MIN)
@@ -117,6 +116,25 @@ def own_roughness(bsdf):
 
         return principled
     return None
+
+
+def clearcoat_roughness(bsdf):
+    """A function of (si, active): alpha of a principled BSDF's clearcoat, infinite where it has
+    none; None for BSDFs without one. After Burley (2012): 0.1 to 0.001 as its gloss rises."""
+    found = children(bsdf)
+    if "clearcoat" not in found or "clearcoat_gloss" not in found:
+        return None
+
+    def alpha(si, active):
+        gloss = _value(found["clearcoat_gloss"], si, active)
+        coated = _value(found["clearcoat"], si, active) > 0
+        return dr.select(coated, dr.lerp(0.1, 0.001, gloss), dr.inf)
+
+    return alpha
+
+
+def _value(source, si, active):
+    return source.eval_1(si, active) if isinstance(source, mi.Texture) else mi.Float(source)
 
 
 def roughness_source(bsdf):

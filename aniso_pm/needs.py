@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from .emission import only_photons_see
 from .ndf import children, nested_bsdfs, roughness_source
-from .receivers import is_lambertian, may_gather
+from .receivers import has_walked_part, is_bent, is_lambertian, may_gather
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,7 @@ class Needs:
                vertex, and caustics exist.
     receivers  surfaces that photons are stored on.
     general    receivers that are not Lambertian.
+    bent       surfaces with bump or normal maps.
     unreadable glossy surfaces whose roughness cannot be read: kernels behind them are discs.
     unseen     emitters whose direct light only photons can find.
     """
@@ -28,6 +29,7 @@ class Needs:
     chains: list[str] = field(default_factory=list)
     receivers: list[str] = field(default_factory=list)
     general: list[str] = field(default_factory=list)
+    bent: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
 
@@ -42,6 +44,12 @@ def read_scene(scene, gather_roughness: float) -> Needs:
     for emitter in scene.emitters():
         if only_photons_see(emitter):
             needs.unseen.append(emitter_name(emitter))
+    for sensor in scene.sensors():
+        if sensor.get_medium() is not None:
+            raise ValueError(
+                f'aniso_pm: sensor "{sensor.id()}" is in a participating medium, which this '
+                'integrator does not support; remove the medium or use the integrator "volpath"'
+            )
     seen = set()
     for shape in scene.shapes():
         name = shape.id() or shape.class_name()
@@ -52,8 +60,9 @@ def read_scene(scene, gather_roughness: float) -> Needs:
             )
         if shape.class_name() == "Instance":
             # Its shapes cannot be reached from Python: anything may be among them.
-            for need in (needs.lobes, needs.chains, needs.receivers, needs.general):
+            for need in (needs.lobes, needs.chains, needs.receivers, needs.general, needs.bent):
                 need.append(f"{name}: Instance")
+            _refuse_unlit(needs, f"{name}: Instance")
             continue
         bsdf = shape.bsdf()
         if bsdf is None or bsdf.ptr in seen:
@@ -66,19 +75,35 @@ def read_scene(scene, gather_roughness: float) -> Needs:
             continue
         if may_gather(bsdf, gather_roughness):
             needs.general.append(evidence)
-        needs.chains.append(evidence)
-        glossy = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
-        if glossy and roughness_source(bsdf) is None:
+        if has_walked_part(bsdf, gather_roughness):
+            needs.chains.append(evidence)
+        if is_bent(bsdf):
+            needs.bent.append(evidence)
+        if _is_unreadable(bsdf):
             needs.unreadable.append(evidence)
         if _may_be_anisotropic(bsdf):
             needs.lobes.append(evidence)
-        if needs.unseen and glossy:
-            raise ValueError(
-                f'aniso_pm: emitter "{needs.unseen[0]}" casts parallel light that glossy surfaces '
-                f'("{evidence}") cannot be lit by in this integrator; use "directional", "spot" or '
-                '"area" instead'
-            )
+        unlit = (mi.BSDFFlags.Glossy, mi.BSDFFlags.DiffuseTransmission)
+        if any(mi.has_flag(bsdf.flags(), flag) for flag in unlit):
+            _refuse_unlit(needs, evidence)
     return needs
+
+
+def _refuse_unlit(needs: Needs, evidence: str):
+    if needs.unseen:
+        raise ValueError(
+            f'aniso_pm: emitter "{needs.unseen[0]}" casts parallel light that the surface '
+            f'"{evidence}" cannot be lit by in this integrator (glossy or transmitting, or maybe '
+            'so); use "directional", "spot" or "area" instead'
+        )
+
+
+def _is_unreadable(bsdf) -> bool:
+    """Is there a glossy BSDF in the tree whose roughness cannot be read?"""
+    nested = nested_bsdfs(children(bsdf))
+    if nested:
+        return any(_is_unreadable(b) for b in nested)
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) and roughness_source(bsdf) is None
 
 
 def emitter_name(emitter) -> str:

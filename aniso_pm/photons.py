@@ -14,6 +14,11 @@ Shading normals make light transport asymmetric. At a bounce the importance-tran
 receiver's cosine is that of the shading normal, while flux arrives per geometric area, so the
 photon carries the factor |wi·n_s| / |wi·n_g|.
 
+Bump and normal maps have a third normal, known to the BSDF alone, and directions that the viewer's
+side can see but sampling from the light's side never finds. There half of the smooth bounces are
+drawn from the cosine hemisphere, all are weighted by the BSDF as the viewer evaluates it, f(v, l)
+with v the direction in which light leaves, and delta bounces by the cosines to their own normal.
+
 Photons are counted while they are stored. If a buffer turns out too small it is enlarged to the
 count and the same paths are traced again: none is ever lost.
 """
@@ -29,7 +34,7 @@ import mitsuba as mi
 from . import index as spatial
 from .emission import Emission, only_photons_see
 from .rays import largest_coordinate, spawn_ray
-from .receivers import gathered_part, read_receiver
+from .receivers import gathered_part, read_bent, read_receiver
 
 # Light paths traced at once: bounds the memory of a wavefront, not the number of photons.
 WAVEFRONT = 1 << 21
@@ -47,6 +52,7 @@ class TraceOptions:
     general       the scene has receivers that are not Lambertian: keep directions.
     roughness     smallest alpha that is gathered on.
     unseen_light  the scene has direct light that only photons can find.
+    bent          the scene has bump or normal maps.
     wavelengths   nm, of all photons (spectral variants), else None.
     """
 
@@ -56,6 +62,7 @@ class TraceOptions:
     general: bool
     roughness: float
     unseen_light: bool
+    bent: bool
     wavelengths: Any = None
 
 
@@ -293,14 +300,18 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
         # --- Scatter ---
         active &= depth < max_depth
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        bent = mi.Bool(False)
+        if dr.hint(o.bent, mode="scalar"):
+            bent = read_bent(bsdf, active)
+            bs, bent_weight = _bent_bounce(ctx, bsdf, si, bs, weight, sampler, bent)
+            weight = dr.select(bent, bent_weight, weight)
         wo = si.to_world(bs.wo)
         wo_n, wo_s = dr.dot(wo, si.n), mi.Frame3f.cos_theta(bs.wo)
         # A reflection through the geometric surface would leak, and its correction has no bound.
         reflected = mi.Frame3f.cos_theta(si.wi) * wo_s > 0
         active &= ~reflected | (same_side & (wo_n * wo_s > 0))
         active &= ~dr.all(weight == 0)  # failed samples have no direction to correct for
-        correction = dr.abs((wi_s * wo_n) / (wo_s * wi_n))
-        β *= weight * correction
+        β *= weight * dr.abs(wo_n / wi_n) * dr.select(bent, 1, dr.abs(wi_s / wo_s))
         η *= bs.eta
 
         # --- Which part of the BSDF was it? ---
@@ -309,8 +320,9 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
             if dr.hint(o.general, mode="scalar"):
                 mixed = is_receiver & ~lambertian
                 smooth = mixed & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-                f_g = gathered_part(bsdf, si, bs.wo, o.roughness, smooth)
-                f = bsdf.eval(ctx, si, bs.wo, smooth)
+                viewed = _viewed(si, bs.wo)
+                f_g = gathered_part(bsdf, viewed, si.wi, o.roughness, smooth)
+                f = bsdf.eval(mi.BSDFContext(), viewed, si.wi, smooth)
                 g = dr.select(smooth & (f > 0), dr.clip(f_g / f, 0, 1), 0)
                 chance = dr.mean(g)
                 gathers = is_receiver & (lambertian | (sampler.next_1d(active) < chance))
@@ -331,6 +343,38 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
 
         ray = spawn_ray(si, wo, reach)
         depth += 1
+
+
+def _viewed(si, direction):
+    """The surface seen from another direction (local)."""
+    seen = mi.SurfaceInteraction3f(si)
+    seen.wi = direction
+    return seen
+
+
+def _bent_bounce(ctx, bsdf, si, bs, weight, sampler, active):
+    """(BSDF sample, f(v, l)/p or delta weight) at bump and normal maps, see the module's head."""
+    m = si.wi + bs.wo * bs.eta  # along the normal that a delta bounce knows
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    cosines = dr.abs(dr.dot(m, si.wi) / dr.dot(m, bs.wo))
+    cosines = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null), 1, cosines)
+
+    drawn = active & (sampler.next_1d(active) < 0.5)
+    cosine_wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d(active))
+    cosine_wo.z = dr.mulsign(cosine_wo.z, mi.Frame3f.cos_theta(si.wi))
+    bs = mi.BSDFSample3f(bs)
+    bs.wo = dr.select(drawn, cosine_wo, bs.wo)
+    bs.eta = dr.select(drawn, 1, bs.eta)
+    bs.sampled_type = dr.select(drawn, int(mi.BSDFFlags.DiffuseReflection), bs.sampled_type)
+
+    delta &= ~drawn
+    smooth = active & ~delta
+    same_side = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo) > 0
+    pdf = 0.5 * bsdf.pdf(ctx, si, bs.wo, smooth)
+    pdf += dr.select(same_side, 0.5 * dr.inv_pi * dr.abs(mi.Frame3f.cos_theta(bs.wo)), 0)
+    value = bsdf.eval(mi.BSDFContext(), _viewed(si, bs.wo), si.wi, smooth)
+    value = dr.select(pdf > 0, value / pdf, 0)
+    return bs, dr.select(delta, 2 * weight * cosines, value)
 
 
 def _pack(spectrum):

@@ -93,6 +93,14 @@ class Prepared:
         return "final_gather" if self.settings.final_gather else self.settings.map
 
     @property
+    def crowding(self) -> int:
+        """Share of a wavefront's eye paths that may be traced at once: where paths leave gather
+        points at several vertices, fewer of them fit into the same memory."""
+        if self.use == "caustic":
+            return 8
+        return 2 if self.use == "final_gather" or self.needs.general else 1
+
+    @property
     def min_segments(self) -> int:
         """Segments of the shortest light path in the map."""
         return 1 if self.needs.unseen else 2
@@ -136,6 +144,7 @@ class Prepared:
             bool(self.needs.general),
             s.gather_roughness,
             bool(self.needs.unseen),
+            bool(self.needs.bent),
             wavelengths,
         )
         seed = stream_seed(seed, PHOTONS, index)

@@ -28,7 +28,7 @@ from .prepared import EYE, PROBE, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
 from .stopping import Stopping
 
-# Eye samples traced at once: bounds memory (about 250 bytes a sample).
+# Eye samples traced at once: bounds memory (some 250 bytes a sample, and 400 a gather point).
 WAVEFRONT = 1 << 21
 # Passes that make the colours of a spectral picture right within about a percent.
 _SPECTRAL_PASSES = 16
@@ -285,7 +285,7 @@ class _Run:
         scene, sensor, map_ = self.scene, self.sensor, self.map
         film = sensor.film()
         pixels = films.pixel_count(film)
-        per_wavefront = max(1, min(spp, WAVEFRONT // pixels))
+        per_wavefront = max(1, min(spp, WAVEFRONT // scene.crowding // pixels))
         # An array, not a number: as a literal it would make every pass compile kernels of its own.
         radius = dr.opaque(mi.Float, self.radius)
         image = None

@@ -18,7 +18,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .ndf import children, nested_bsdfs, own_roughness
+from .ndf import children, clearcoat_roughness, nested_bsdfs, own_roughness
 
 _WRAPPERS = ("TwoSidedBRDF", "BlendBSDF", "MaskBSDF", "BumpMap", "NormalMap")
 # BSDFs that evaluate exactly the components that BSDFContext.type_mask asks for.
@@ -54,7 +54,7 @@ def may_gather(bsdf, threshold: float) -> bool:
         return False
     if _varies(bsdf):
         return True
-    return float(mi.Float(smallest(dr.zeros(mi.SurfaceInteraction3f), True))[0]) >= threshold
+    return _uniform(smallest) >= threshold
 
 
 def read_receiver(bsdf, si, threshold: float, general: bool, active):
@@ -70,7 +70,8 @@ def read_receiver(bsdf, si, threshold: float, general: bool, active):
         if is_lambertian(instance):
             up = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), mi.Frame3f.cos_theta(si.wi)))
             value = instance.eval(mi.BSDFContext(), si, up, active)
-            return dr.max(value) > 0, mi.Bool(True), value
+            # By side, not by value: kernels of lit texels reach over black ones.
+            return _reflects(instance, si), mi.Bool(True), value
         whole, diffuse = _gathered(instance, si, threshold, active) if general else (False, False)
         return mi.Bool(diffuse) | whole, mi.Bool(False), mi.Spectrum(0)
 
@@ -99,6 +100,47 @@ def gathered_part(bsdf, si, wo, threshold: float, active):
     return dr.dispatch(bsdf, evaluate, si, wo, active)
 
 
+def has_walked_part(bsdf, threshold: float) -> bool:
+    """Can the part of this BSDF that is not gathered be anything but zero?"""
+    if is_lambertian(bsdf):
+        return False
+    flags = mi.BSDFFlags
+    if mi.has_flag(bsdf.flags(), flags.Delta) or mi.has_flag(bsdf.flags(), flags.Transmission):
+        return True
+    smallest = _smallest_roughness(bsdf)
+    if smallest is None or (mi.has_flag(bsdf.flags(), flags.Glossy) and _varies(bsdf)):
+        return True
+    return not _uniform(smallest) >= threshold
+
+
+def is_bent(bsdf) -> bool:
+    """Is there a bump or normal map in the tree? Its BSDF takes cosines to a normal of its own."""
+    nested = nested_bsdfs(children(bsdf)) if bsdf.class_name() in _WRAPPERS else []
+    return bsdf.class_name() in ("BumpMap", "NormalMap") or any(is_bent(b) for b in nested)
+
+
+def read_bent(bsdf, active):
+    """``is_bent`` per lane of mi.BSDFPtr."""
+
+    def read(instance, active):
+        return mi.Bool(instance is not None and is_bent(instance))
+
+    return dr.dispatch(bsdf, read, active)
+
+
+def _reflects(bsdf, si):
+    """Does the BSDF reflect on the side that si.wi is on?"""
+    front, back = (
+        mi.has_flag(bsdf.flags(), f) for f in (mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide)
+    )
+    return dr.select(mi.Frame3f.cos_theta(si.wi) > 0, mi.Bool(front), mi.Bool(back))
+
+
+def _uniform(function) -> float:
+    """Value of a function of (si, active) that is the same everywhere."""
+    return float(mi.Float(function(dr.zeros(mi.SurfaceInteraction3f), True))[0])
+
+
 def _gathered(bsdf, si, threshold, active):
     """(gathered as a whole, per lane or False; is its diffuse component gathered anyway?)"""
     smallest = _smallest_roughness(bsdf)
@@ -125,6 +167,9 @@ def _smallest_roughness(bsdf):
     if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy):
         return lambda si, active: mi.Float(dr.inf)
     own = own_roughness(bsdf)
+    coat = clearcoat_roughness(bsdf)
+    if own is not None and coat is not None:
+        return lambda si, active: dr.minimum(dr.minimum(*own(si, active)), coat(si, active))
     if own is not None:
         return lambda si, active: dr.minimum(*own(si, active))
     nested = nested_bsdfs(children(bsdf)) if bsdf.class_name() in _WRAPPERS else []

@@ -57,7 +57,7 @@ def rgb(*value):
 def image(shape, seed, raw=False, low=0.0, high=1.0):
     """A bitmap of random texels."""
     data = np.random.default_rng(seed).uniform(low, high, shape).astype(np.float32)
-    return {"type": "bitmap", "data": mi.TensorXf(data), "raw": raw, "filter_type": "nearest"}
+    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": raw, "filter_type": "nearest"}
 
 
 def ball(bsdf, y=-0.45, radius=0.4):
@@ -211,8 +211,17 @@ def rows():
     }
     mask = lambda b: {"type": "mask", "opacity": 0.6, "b": {"type": "twosided", "b": b}}  # noqa: E731
     normal = image((4, 4, 3), 3, True, 0.4, 0.6)
-    normal["data"] = mi.TensorXf(np.array(normal["data"]) * [1, 1, 0] + np.float32([0, 0, 0.95]))
+    texels = np.array(normal["bitmap"]) * [1, 1, 0] + [0, 0, 0.95]
+    normal["bitmap"] = mi.Bitmap(texels.astype(np.float32))
     normalmap = lambda b: {"type": "normalmap", "normalmap": normal, "b": b}  # noqa: E731
+    tilt = np.full((2, 2, 3), 0.5, np.float32) + 0.5 * np.float32([0.259, 0, 0.966])  # 15 degrees
+    tilted = lambda b: {  # noqa: E731
+        "type": "normalmap",
+        "normalmap": {"type": "bitmap", "bitmap": mi.Bitmap(tilt), "raw": True},
+        "b": b,
+    }
+    chequers = {"type": "checkerboard", "color0": 0.9, "color1": 0.0}
+    chequers["to_uv"] = T().scale([6, 6, 1])
     floor = lambda b: {"floor": wall(T().translate([0, -1, 0]).rotate([1, 0, 0], -90), None, b)}  # noqa: E731
     table = {
         # --- every light on diffuse surfaces ---
@@ -282,6 +291,9 @@ def rows():
         "mask of diffuse": Row(objects=ball(mask(diffuse)), reference="prb"),
         "bumpmap of roughplastic": Row(objects=plate(bump(glossy))),
         "normalmap of roughconductor": Row(objects=plate(normalmap(rough | {"alpha": 0.2}))),
+        "tilted diffuse floor under a spot": Row("spot", floor(tilted(diffuse))),
+        "tilted metal floor under a spot": Row("spot", floor(tilted(rough | {"alpha": 0.1}))),
+        "black chequers": Row(objects=floor({"type": "diffuse", "reflectance": chequers})),
         "bump of mask of twosided": Row(
             objects=plate(bump(mask(matt)), both=False), reference="prb"
         ),

@@ -38,6 +38,26 @@ def test_without_caustics_a_caustic_map_is_no_map():
     assert integrator.statistics["photons_emitted"] == 0
 
 
+def test_what_is_gathered_as_a_whole_casts_no_caustics():
+    bumped = matrix.rows()["tilted diffuse floor under a spot"]
+    scene = matrix.make(bumped, size=4)
+    found = prepare(scene, Settings(map="caustic"), False)
+    assert not found.needs_map and found.needs.bent
+
+
+def test_a_clearcoat_is_a_smooth_lobe():
+    objects = matrix.ball({"type": "principled", "roughness": 0.8, "clearcoat": 0.5})
+    scene = matrix.make(matrix.Row(objects=objects), size=4)
+    assert not prepare(scene, Settings(), False).needs.general
+
+
+def test_a_readable_part_does_not_hide_an_unreadable_one():
+    blend = {"type": "blendbsdf", "weight": 0.5, "a": {"type": "roughconductor"}}
+    objects = matrix.ball(blend | {"b": {"type": "hair"}})
+    scene = matrix.make(matrix.Row(objects=objects), size=4)
+    assert len(prepare(scene, Settings(), False).needs.unreadable) == 1
+
+
 def test_evidence_names_shape_and_nested_bsdfs():
     found = findings("brushed conductor")
     assert found["anisotropic lobes"].evidence == ["plate: TwoSidedBRDF(RoughConductor)"]

@@ -320,6 +320,21 @@ def test_media_are_refused_with_one_sentence(rgb):
         integrator().render(scene, spp=1)
 
 
+def test_a_camera_in_a_medium_is_refused(rgb):
+    definition = room(size=4)
+    definition["sensor"]["medium"] = {"type": "homogeneous", "albedo": 0.5}
+    with pytest.raises(ValueError, match='sensor "sensor" is in a participating medium'):
+        integrator().render(mi.load_dict(definition), spp=1)
+
+
+def test_a_point_light_of_sampling_weight_zero_is_dark_as_in_path(rgb):
+    definition = room(size=8)
+    definition["bulb"] = {"type": "point", "intensity": 20.0, "sampling_weight": 0.0}
+    image = array(mi.render(mi.load_dict(definition), integrator=integrator(), spp=64))
+    path = array(mi.render(mi.load_dict(definition), integrator=mi.load_dict({"type": "path"})))
+    assert image.mean() == pytest.approx(path.mean(), rel=0.1)  # 7 times as bright with the bulb
+
+
 def test_derivatives_are_refused_with_one_sentence(scene):
     plugin = integrator()
     with pytest.raises(Exception, match="derivatives are not supported"):
@@ -340,8 +355,12 @@ def test_a_scene_without_shapes_is_rendered(rgb):
     np.testing.assert_allclose(image[..., :3], 0.25, rtol=1e-3)
 
 
-def test_light_that_only_photons_find_is_refused_among_glossy_surfaces(rgb):
+@pytest.mark.parametrize("instanced", [False, True])
+def test_light_that_only_photons_find_is_refused_among_glossy_surfaces(rgb, instanced):
     definition = room_with_plate(size=4)
+    if instanced:
+        definition["group"] = {"type": "shapegroup", "plate": definition.pop("plate")}
+        definition["copy"] = {"type": "instance", "g": {"type": "ref", "id": "group"}}
     definition["light"]["emitter"] = {"type": "directionalarea"}
     with pytest.raises(ValueError, match="DirectionalArea.*parallel light"):
         integrator().render(mi.load_dict(definition), spp=1)

@@ -41,7 +41,7 @@ def furnace(flip=False, **emitter):
 
 def build(scene, count, seed, max_depth, rr_depth, expected=0, **options):
     defaults = {"caustics": "ignored", "general": False, "roughness": 0.2, "unseen_light": False}
-    options = photons.TraceOptions(max_depth, rr_depth, **(defaults | options))
+    options = photons.TraceOptions(max_depth, rr_depth, **(defaults | {"bent": False} | options))
     return photons.build_map(scene, emission.prepare(scene), count, seed, options, expected)
 
 
@@ -105,6 +105,7 @@ def test_nothing_is_stored_on_the_back_of_one_sided_surfaces():
             "lamp": {
                 "type": "sphere",
                 "radius": 0.1,
+                "bsdf": {"type": "conductor", "material": "none"},
                 "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
             },
         }
