@@ -234,7 +234,7 @@ def rows():
         "projector, diffuse": Row("projector", block(diffuse)),
         "directional, diffuse": Row("directional", block(diffuse)),
         "directionalarea, diffuse": Row(
-            "directionalarea", block(diffuse), reference="ptracer", spp=2048, whole=True
+            "directionalarea", block(diffuse), reference="ptracer", spp=8192, whole=True
         ),
         "constant, diffuse": Row("constant", block(diffuse)),
         "envmap, diffuse": Row("envmap", block(diffuse)),

@@ -372,8 +372,11 @@ def test_version_and_help(run):
 def test_ctrl_c_writes_the_picture_so_far(scene, tmp_path):
     path = scene(OURS)
     arguments = ["render", path, "-o", "a.exr", "--spp", "100000", "--passes", "100000"]
-    program = process(*arguments, cwd=tmp_path)
-    time.sleep(5)  # well past loading and the first passes
+    program = process(*arguments, "--save-every", 1, cwd=tmp_path)
+    for _ in range(600):  # until there are passes
+        if (tmp_path / "a.exr").exists():
+            break
+        time.sleep(0.1)
     program.send_signal(signal.SIGINT)
     _, stderr = program.communicate(timeout=60)
     assert program.returncode == 130, stderr

@@ -224,11 +224,17 @@ def test_a_real_interrupt_ends_in_a_picture(scene):
     import signal
 
     plugin = integrator(passes=1000)
-    mi.render(scene, integrator=integrator(passes=2), spp=2)  # compile
     handler = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
-        for delay in (0.9, 1.3, 1.7):
-            signal.setitimer(signal.ITIMER_REAL, delay)
+        for delay in (0.01, 0.3, 0.7):
+            armed = []
+
+            def after_first_wavefront(*_, armed=armed, delay=delay):
+                if not armed:
+                    signal.setitimer(signal.ITIMER_REAL, delay)
+                    armed.append(True)
+
+            plugin.progress = after_first_wavefront
             image = array(plugin.render(scene, spp=1000))
             assert plugin.statistics["interrupted"]
             assert 0 < plugin.statistics["spp"] < 1000
