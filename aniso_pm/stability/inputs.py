@@ -72,7 +72,7 @@ def _render(integrator):
     with_photons = getattr(integrator, "settings", None)
     if with_photons and with_photons.photon_count > 10**6:
         return np.zeros(1)  # allowed, but too many to trace here
-    return np.array(mi.render(_small_room(), integrator=integrator, spp=1))
+    return np.array(mi.render(_small_room(), integrator=integrator, spp=2))
 
 
 def _all_clear(complaints) -> Measured:
@@ -81,7 +81,8 @@ def _all_clear(complaints) -> Measured:
 
 
 def _integrator(name, kind) -> Measured:
-    small = {"type": "aniso_pm", "photon_count": 1000}
+    # Two passes: some stopping rules that are allowed would not stop today.
+    small = {"type": "aniso_pm", "photon_count": 1000, "passes": 2}
     return _all_clear(
         _unclear("aniso_pm", name, v, partial(mi.load_dict, small | {name: v}), _render)
         for v in WRONG[kind]
