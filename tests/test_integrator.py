@@ -225,6 +225,7 @@ def test_a_real_interrupt_ends_in_a_picture(scene):
 
     plugin = integrator(passes=1000)
     handler = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    ctrl_c = signal.signal(signal.SIGINT, signal.default_int_handler)  # in background jobs, too
     try:
         for delay in (0.01, 0.3, 0.7):
             armed = []
@@ -242,6 +243,7 @@ def test_a_real_interrupt_ends_in_a_picture(scene):
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, handler)
+        signal.signal(signal.SIGINT, ctrl_c)
 
 
 def test_statistics_of_an_earlier_render_do_not_survive_a_failure(scene):
