@@ -174,6 +174,19 @@ def test_variance_predicts_the_spread_between_seeds(filter_):
     assert np.median(ratio) == pytest.approx(1.03, abs=0.15)
 
 
+def test_squared_sums_cannot_overflow():
+    """Passes of 1e-30, 1 and 1e38 in three channels: m passes of A and 3A have the variance of
+    their mean, A²/(m − 1) with A the distance of each from it."""
+    shape, scale = (1, 1, 4), np.array([1e-30, 1.0, 1e38])
+    sums = Sums.zeros(shape, True)
+    for factor in (1, 3, 1, 3):
+        film = np.concatenate([factor * scale, [1.0]]).astype(np.float32).reshape(shape)
+        sums = sums.plus(mi.TensorXf(film))
+    mean, variance = mean_and_variance(sums.arrays(), 4)
+    np.testing.assert_allclose(mean[0, 0], 2 * scale, rtol=1e-6)
+    np.testing.assert_allclose(variance[0, 0], scale**2 / 3, rtol=1e-5)
+
+
 def test_one_pass_has_no_variance():
     plugin = integrator()
     render(load(), plugin, 2)
