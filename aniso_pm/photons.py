@@ -373,7 +373,9 @@ def _bent_bounce(ctx, bsdf, si, bs, weight, sampler, active):
     pdf = 0.5 * bsdf.pdf(ctx, si, bs.wo, smooth)
     pdf += dr.select(same_side, 0.5 * dr.inv_pi * dr.abs(mi.Frame3f.cos_theta(bs.wo)), 0)
     value = bsdf.eval(mi.BSDFContext(), _viewed(si, bs.wo), si.wi, smooth)
-    value = dr.select(pdf > 0, value / pdf, 0)
+    # A sample that failed is no sample of that density, wherever it points.
+    failed = ~drawn & dr.all(weight == 0)
+    value = dr.select((pdf > 0) & ~failed, value / pdf, 0)
     return bs, dr.select(delta, 2 * weight * cosines, value)
 
 
