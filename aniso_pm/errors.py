@@ -52,7 +52,7 @@ def _root(error: BaseException) -> str:
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """Whether ``error`` is Ctrl-C, itself or below the exceptions that were raised because of it."""
+    """Whether ``error`` is Ctrl-C, itself or below what was raised because of it."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True
