@@ -395,7 +395,7 @@ def mean_and_error(row, integrator, spp, seeds):
     return float(np.mean(values)), float(np.std(values, ddof=1) / len(values) ** 0.5)
 
 
-def compare(row, use, expected, seeds=range(5), passes=4, share=8):
+def compare(row, use, expected, seeds=range(8), passes=4, share=8):
     """(ratio of our energy to the reference's, standard error of both together). We take 1/share
     of the reference's samples per pixel."""
     integrator = PHOTON_MAPPER | USES[use] | {"passes": passes}
