@@ -12,10 +12,10 @@ from types import SimpleNamespace
 import aniso_pm  # before drjit and mitsuba: it chooses their LLVM
 
 # isort: split
-import mitsuba as mi
 import numpy as np
 
-# The references in 50 digits, one lobe at a time, are those of `aniso-pm stability`.
+# Conversions, and the references in 50 digits, are those of `aniso-pm stability`.
+from aniso_pm.stability.lanes import arr, f32, flt, unit, vec  # noqa: F401
 from aniso_pm.stability.reference import (  # noqa: F401
     floats,
     mp_cross,
@@ -28,30 +28,6 @@ from aniso_pm.stability.reference import (  # noqa: F401
 )
 
 # --- Between numpy, Dr.Jit and mpmath ------------------------------------------------------------
-
-
-def f32(a):
-    """Round to single precision, keep as double."""
-    return np.asarray(a, np.float32).astype(np.float64)
-
-
-def vec(a):
-    """(n, 3) or (3,) array → mi.Vector3f."""
-    return mi.Vector3f(*np.asarray(a, np.float32).reshape(-1, 3).T.copy())
-
-
-def flt(a):
-    return mi.Float(np.asarray(a, np.float32).reshape(-1).copy())
-
-
-def arr(a):
-    """Dr.Jit array → float64 numpy array, vectors as (n, 3)."""
-    a = np.array(a, np.float64)
-    return a.T if a.ndim == 2 else a
-
-
-def unit(a):
-    return a / np.linalg.norm(a, axis=-1, keepdims=True)
 
 
 def dot(a, b):

@@ -113,21 +113,17 @@ def test_crop_window_is_that_part_of_the_picture(rgb):
     np.testing.assert_allclose(part.mean((0, 1)), whole[7:13, 5:13].mean((0, 1)), rtol=0.05)
 
 
+def camera_with_alpha(size):
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba"}
+    return {"type": "perspective", "film": film | {"rfilter": {"type": "box"}}}
+
+
 @pytest.mark.parametrize("hide", [False, True])
 def test_alpha_and_hidden_emitters_are_those_of_path(rgb, hide):
     scene = mi.load_dict(
         {
             "type": "scene",
-            "sensor": {
-                "type": "perspective",
-                "film": {
-                    "type": "hdrfilm",
-                    "width": 16,
-                    "height": 16,
-                    "pixel_format": "rgba",
-                    "rfilter": {"type": "box"},
-                },
-            },
+            "sensor": camera_with_alpha(16),
             "sky": {"type": "constant", "radiance": 0.5},
             "lamp": {
                 "type": "sphere",
@@ -385,16 +381,7 @@ def test_hidden_sky_stays_hidden_behind_null_surfaces_as_in_path(rgb, front):
     scene = mi.load_dict(
         {
             "type": "scene",
-            "sensor": {
-                "type": "perspective",
-                "film": {
-                    "type": "hdrfilm",
-                    "width": 8,
-                    "height": 8,
-                    "pixel_format": "rgba",
-                    "rfilter": {"type": "box"},
-                },
-            },
+            "sensor": camera_with_alpha(8),
             "sky": {"type": "constant", "radiance": 0.5},
             "sheet": {
                 "type": "rectangle",
