@@ -1,0 +1,251 @@
+"""``aniso-pm render`` and ``aniso-pm merge``."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from aniso_pm import output
+from aniso_pm.errors import InputError, is_interrupt, one_line
+from aniso_pm.progress import bar
+
+from .common import (
+    INTERRUPTED,
+    Define,
+    InterruptError,
+    SceneFile,
+    Variant,
+    load,
+    mitsuba_log,
+    parse_defines,
+    set_variant,
+)
+
+
+def render(
+    scene: SceneFile,
+    out: Annotated[Path, typer.Option("--output", "-o", help="Picture to write (.exr).")],
+    variant: Variant = "llvm_ad_rgb",
+    define: Define = None,
+    spp: Annotated[
+        int | None, typer.Option(min=1, max=2**31 - 1, help="Samples per pixel in all.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Random seed.")] = 0,
+    passes: Annotated[
+        int | None, typer.Option(min=1, max=10**7, help="Stop after so many passes.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--time", min=0.001, help="Stop after so many seconds.")
+    ] = None,
+    target_error: Annotated[
+        float | None,
+        typer.Option(min=1e-6, help="Stop at this relative standard error (0.02: 2 %)."),
+    ] = None,
+    first_pass: Annotated[
+        int, typer.Option(min=0, max=10**7, help="Number of the first pass.")
+    ] = 0,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the state beside the picture.")
+    ] = False,
+    keep_state: Annotated[
+        bool, typer.Option("--keep-state", help="Keep the state of a finished picture, to merge.")
+    ] = False,
+    save_every: Annotated[
+        float, typer.Option(min=0, help="Seconds between savings of picture and state.")
+    ] = 30.0,
+    sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
+    png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no warnings.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
+    ] = False,
+) -> int:
+    """Render a scene with the integrator it names and write the picture as OpenEXR.
+
+    The header of the picture records parameters, seed, versions, timings and statistics. With
+    several passes the layers "variance" and "standard_error" tell how noisy the picture is.
+
+    --passes, --time and --target-error take the place of all the scene's own stopping rules.
+    While passes are rendered, the picture so far and its state (OUT with the suffix .state) are
+    saved again and again; --resume goes on from there. Finished pictures lose their state unless
+    --resume or --keep-state was given. Passes 8 to 15 of a picture, to be merged with passes 0 to
+    7, are --first-pass 8 --passes 8 with the same samples per pass.
+    """
+    # --- Find out what would fail, before anything slow ---
+    defines = parse_defines(define or [])
+    if out.suffix.lower() != ".exr":
+        raise InputError(f"cannot write '{out}': the output's name must end in .exr")
+    picture = out.with_suffix(".png") if png else None
+    for path in filter(None, [out, picture]):
+        output.check_writable(path)
+    if not scene.is_file():
+        raise InputError(f"{scene}: there is no such file")
+
+    set_variant(variant)
+    with mitsuba_log(quiet):
+        # --- Load the scene ---
+        started = time.perf_counter()
+        world, camera, integrator = load(scene, defines, sensor)
+        loaded = time.perf_counter()
+        rules = {"passes": passes, "time": seconds, "target_error": target_error}
+        rules = {name: value for name, value in rules.items() if value is not None}
+        kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state)
+        made_by = {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
+
+        def write() -> dict[str, Any]:
+            """Write the picture so far and what made it."""
+            record = _record(integrator, camera) | made_by
+            now = time.perf_counter()
+            record["seconds"] = {"load": loaded - started, "render": now - loaded}
+            variance = getattr(integrator, "variance", None)
+            output.write_exr(camera.film(), out, record, variance)
+            if picture:
+                output.write_png(camera.film(), picture)
+            return record
+
+        # --- Render ---
+        state_file = out.with_suffix(".state")
+        if kept is not None:
+            from aniso_pm.state import Checkpoint
+
+            output.sweep(state_file)
+            output.sweep(out)
+            integrator.checkpoint = Checkpoint(state_file, save_every, resume, write)
+            if resume and not state_file.exists() and not quiet:
+                print(f"aniso-pm: no state '{state_file}' yet, starting afresh", file=sys.stderr)
+        _render(world, camera, integrator, seed, spp, quiet)
+        record = write()
+        statistics = record["statistics"]
+        if kept is False and not statistics["interrupted"]:
+            state_file.unlink(missing_ok=True)
+
+    if as_json:
+        record |= {"output": str(out), "png": str(picture) if picture else None}
+        print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
+    if statistics.get("interrupted"):
+        print("aniso-pm: interrupted, the picture so far is written", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def merge(
+    states: Annotated[list[Path], typer.Argument(help="States (.state), or their pictures.")],
+    out: Annotated[Path, typer.Option("--output", "-o", help="Picture to write (.exr).")],
+    png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
+    ] = False,
+) -> int:
+    """Add up passes of one picture that were rendered apart, with --keep-state.
+
+    Writes the picture and, beside it, the state of all passes, from which it can be merged again
+    or resumed. All must have the same scene, parameters, seed and samples per pass, and no pass
+    may occur twice.
+    """
+    from aniso_pm import film as films
+    from aniso_pm.state import State, StateError
+    from aniso_pm.state import merge as merged
+
+    if out.suffix.lower() != ".exr":
+        raise InputError(f"cannot write '{out}': the output's name must end in .exr")
+    picture = out.with_suffix(".png") if png else None
+    for path in filter(None, [out, picture]):
+        output.check_writable(path)
+    try:
+        loaded = {}
+        for name in states:
+            path = name.with_suffix(".state") if name.suffix.lower() == ".exr" else name
+            if str(path) in loaded:
+                raise InputError(f"{path}: named twice")
+            loaded[str(path)] = State.load(path)
+        total = merged(loaded)
+    except StateError as error:
+        raise InputError(str(error)) from error
+    except OSError as error:
+        raise InputError(f"{error.filename}: {error.strerror}") from error
+
+    set_variant(total.identity["variant"])
+    try:
+        film = films.from_description(total.film)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    films.show_array(film, total.arrays["first"])
+    record = {
+        "merged": list(loaded),
+        "passes": total.passes,
+        "seed": total.identity["seed"],
+        "variant": total.identity["variant"],
+        "statistics": total.statistics,
+        "depends_on": total.identity,
+    }
+    output.write_exr(film, out, record, total.variance())
+    if picture:
+        output.write_png(film, picture)
+    total.save(out.with_suffix(".state"))
+    if as_json:
+        record |= {"output": str(out), "png": str(picture) if picture else None}
+        print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
+    return 0
+
+
+def _prepare_passes(
+    integrator, rules: dict[str, Any], first_pass: int, keep_state: bool
+) -> bool | None:
+    """Set the options that concern passes; an InputError where the integrator has none.
+
+    Returns whether the state shall stay when all is done, and None where there is none to keep:
+    a single pass has no state unless it is asked for.
+    """
+    if not hasattr(integrator, "stop_after"):
+        options = [f"--{name.replace('_', '-')}" for name in rules]
+        options += ["--first-pass"] if first_pass else []
+        options += ["--resume or --keep-state"] if keep_state else []
+        if options:
+            kind = integrator.class_name()
+            raise InputError(f"{', '.join(options)}: {kind} renders in one pass only")
+        return None
+    if rules:
+        try:
+            integrator.stop_after(**rules)
+        except ValueError as error:
+            raise InputError(one_line(error)) from error
+    integrator.first_pass = first_pass
+    return keep_state if keep_state or integrator.settings.passes != 1 else None
+
+
+def _render(world, camera, integrator, seed: int, spp: int | None, quiet: bool) -> None:
+    """Leave the picture in the camera's film."""
+    visible = not quiet and sys.stderr.isatty() and hasattr(integrator, "progress")
+    try:
+        with bar(integrator, file=sys.stderr, leave=False) if visible else nullcontext():
+            # Not mi.render(): it hides errors inside a differentiable operation.
+            integrator.render(world, sensor=camera, seed=seed, spp=spp or 0)
+    except ValueError as error:
+        # Something the integrator cannot do with this scene or these parameters
+        raise InputError(one_line(error)) from error
+    except BaseException as error:
+        if is_interrupt(error):
+            raise InterruptError from error
+        raise
+
+
+def _record(integrator, camera) -> dict[str, Any]:
+    from aniso_pm.doctor import versions
+
+    statistics = dict(getattr(integrator, "statistics", None) or {})
+    kind = type(integrator)
+    in_python = not kind.__module__.startswith("mitsuba")
+    return {
+        "integrator": kind.__name__ if in_python else integrator.class_name(),
+        # Samplers may round what was asked for.
+        "spp": statistics.get("spp", camera.sampler().sample_count()),
+        "size": [int(pixels) for pixels in camera.film().size()],
+        "parameters": integrator.parameters() if hasattr(integrator, "parameters") else {},
+        "statistics": statistics,
+        "versions": versions(),
+    }
