@@ -102,16 +102,19 @@ def build_map(
     options: TraceOptions,
     expected: int = 0,
     launch=None,
+    lap=lambda stage: None,
 ):
     """Trace ``photon_count`` light paths from ``source`` and index what they leave.
 
     expected  photons to make room for; with too little room the same paths are traced again.
     launch    ``light_paths``, or that function frozen.
+    lap       called with the name of each stage that ends.
     """
     room = max(expected, int(_FIRST_GUESS * photon_count))
     stored, rejected, photons = _trace(
         scene, source, photon_count, seed, options, room, launch or light_paths
     )
+    lap("photons")
     if stored == 0:
         return PhotonMap(photon_count, 0, rejected, None, None, None, None)
     used = dr.arange(mi.UInt32, stored)
@@ -123,6 +126,7 @@ def build_map(
     if options.general:
         direction = dr.gather(mi.UInt32, photons.direction, index.order)
     dr.eval(sorted_flux, direction)
+    lap("index")
     return PhotonMap(
         photon_count, stored, rejected, index, sorted_flux, direction, options.wavelengths
     )

@@ -128,11 +128,17 @@ class Prepared:
         return limit if tested and 0 < limit <= photons.SEGMENTS_MAX else 0
 
     def photon_map(
-        self, seed: int, index: int, expected: int = 0, wavelengths=None
+        self,
+        seed: int,
+        index: int,
+        expected: int = 0,
+        wavelengths=None,
+        lap=lambda stage: None,
     ) -> photons.PhotonMap:
         """Photon map of pass ``index``; empty where nothing in the scene could use one.
 
-        wavelengths: nm, of the photons, in spectral variants.
+        wavelengths: nm, of the photons, in spectral variants. lap: called with the name of each
+        stage that ends, "photons" and "index".
         """
         if not self.needs_map:
             return photons.EMPTY
@@ -149,7 +155,14 @@ class Prepared:
         )
         seed = stream_seed(seed, PHOTONS, index)
         return photons.build_map(
-            self.scene, self.emission, s.photon_count, seed, options, expected, self.launch.light
+            self.scene,
+            self.emission,
+            s.photon_count,
+            seed,
+            options,
+            expected,
+            self.launch.light,
+            lap,
         )
 
     def trace(self, sampler, ray, expected: int = 0):

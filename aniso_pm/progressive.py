@@ -263,13 +263,14 @@ class _Run:
         self.radius = bandwidth(self.radius0, self.scene.settings.alpha, index)
         colour = wavelength_sample(self.seed, index)
         wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
-        self.map = self.scene.photon_map(self.seed, index, self.photons.room, wavelengths)
+        self.map = self.scene.photon_map(
+            self.seed, index, self.photons.room, wavelengths, self.clock.lap
+        )
         self.photons.seen(self.map.stored)
         counts = dict.fromkeys(_COUNTS, 0)
         counts["photons_emitted"] = self.map.emitted
         counts["photons_stored"] = self.map.stored
         counts["photons_rejected"] = self.map.rejected
-        self.clock.lap("photons")
 
         # --- Eye paths ---
         share = self.shares(index)
