@@ -37,7 +37,7 @@ def examine(scene: Prepared) -> list[Finding]:
             f"{scene.use}: photons are traced and gathered"
             if scene.needs_map
             else "no photon is traced: the scene is path traced",
-            needs.receivers or ["no surface gathers"],
+            _why_map(scene) + (needs.receivers or ["no surface gathers"]),
         ),
         Finding(
             "caustics, specular chains",
@@ -100,6 +100,15 @@ def examine(scene: Prepared) -> list[Finding]:
             [spectrum],
         ),
     ]
+
+
+def _why_map(scene: Prepared) -> list[str]:
+    """What ``map=auto`` went by."""
+    if scene.settings.map != "auto":
+        return []
+    needs = scene.needs
+    cause = [f"light over {e}" for e in needs.chains] + [f"light of {e}" for e in needs.unseen]
+    return [f"map=auto: {cause[0] if cause else 'nothing casts caustics'}"]
 
 
 def as_text(findings: list[Finding]) -> str:

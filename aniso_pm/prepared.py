@@ -54,6 +54,7 @@ class Prepared:
     hide_emitters: bool
     emission: emission.Emission | None
     launch: Launch = Launch()
+    light_wavefront: int | None = None  # light paths at once; None: photons.WAVEFRONT
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -89,8 +90,14 @@ class Prepared:
 
     @property
     def use(self) -> str:
-        """How eye paths use the map; see ``eye``."""
-        return "final_gather" if self.settings.final_gather else self.settings.map
+        """How eye paths use the map; see ``eye``. ``auto`` is "global" where light comes over
+        surfaces that paths walk on, or from emitters that only photons find. Elsewhere it is
+        "caustic", which stores and gathers nothing there: path tracing is faster."""
+        if self.settings.final_gather:
+            return "final_gather"
+        if self.settings.map == "auto":
+            return "global" if self.deep or self.needs.unseen else "caustic"
+        return self.settings.map
 
     @property
     def crowding(self) -> int:
@@ -163,6 +170,7 @@ class Prepared:
             expected,
             self.launch.light,
             lap,
+            self.light_wavefront,
         )
 
     def trace(self, sampler, ray, expected: int = 0):
