@@ -13,8 +13,7 @@ scatters is shown by a bootstrap over seeds and blocks of pixels: 95 % intervals
 three of its standard errors of zero cannot be told from the reference's noise; it is drawn hollow
 and does not count for the slope.
 
-``--reference NAME --spp N`` renders a reference with ``path`` first. Needs matplotlib, which the
-extra ``dev`` brings.
+Needs matplotlib, which the extra ``dev`` brings.
 """
 
 import argparse
@@ -24,7 +23,8 @@ from dataclasses import dataclass
 import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
-from make_pictures import HERE, make_reference, read_reference
+from aniso_pm.report import reference as references
+from make_pictures import HERE
 
 # What is looked at: left, top, width, height in pixels of the reference.
 WINDOWS = {
@@ -75,9 +75,9 @@ def load(name):
     parameters["film.crop_offset"] = [left, top]
     parameters["film.crop_size"] = [width, height]
     parameters.update()
-    mean, half_difference = read_reference(name)
+    reference = references.read(HERE / "references" / f"{name}.exr")
     rows, columns = slice(top, top + height), slice(left, left + width)
-    halves = [(mean + k * half_difference)[rows, columns] for k in (1, -1)]
+    halves = [half[rows, columns] for half in reference.halves]
     return scene, halves
 
 
@@ -229,18 +229,14 @@ def plot(results, path):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--reference", choices=list(WINDOWS), help="render this reference, no more")
     parser.add_argument("--scenes", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
     parser.add_argument("--photons", type=int, default=100_000, help="light paths per pass")
-    parser.add_argument("--spp", type=int, help="samples per pass (2), or of the reference (32768)")
+    parser.add_argument("--spp", type=int, default=2, help="samples per pass")
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    if arguments.reference:
-        make_reference(arguments.reference, arguments.spp or 32768)
-    else:
-        # Scenes that are not measured now keep what was measured before.
-        file = HERE / "pictures" / "convergence.json"
-        measured = json.loads(file.read_text()) if file.exists() else {}
-        measured |= run(arguments.scenes, arguments.photons, arguments.spp or 2)
-        file.write_text(json.dumps(measured, indent=1, ensure_ascii=False) + "\n")
-        plot(measured, file.with_suffix(".svg"))
+    # Scenes that are not measured now keep what was measured before.
+    file = HERE / "pictures" / "convergence.json"
+    measured = json.loads(file.read_text()) if file.exists() else {}
+    measured |= run(arguments.scenes, arguments.photons, arguments.spp)
+    file.write_text(json.dumps(measured, indent=1, ensure_ascii=False) + "\n")
+    plot(measured, file.with_suffix(".svg"))

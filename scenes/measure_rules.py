@@ -13,7 +13,8 @@ import aniso_pm  # noqa: F401
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from make_pictures import HERE, SCENES, read_reference, render
+from aniso_pm.report import reference as references
+from make_pictures import HERE, SCENES, render
 from measure_convergence import weights
 
 KERNELS = [("isotropic", "lobe", True)] + [
@@ -35,16 +36,18 @@ def metal_pixels(scene):
 def measure(name, seeds, spp):
     scene = mi.load_file(str(HERE / f"{name}.xml"))
     mask = metal_pixels(scene)
-    reference, noise = read_reference(name)
-    first, second = ((reference + k * noise)[mask] for k in (1, -1))
+    reference = references.read(HERE / "references" / f"{name}.exr")
+    first, second = (half[mask] for half in reference.halves)
     # Not 1/(R² + 0.01) of the same noisy pixel: its error would weigh itself.
-    weight = weights((reference + noise, reference - noise))[mask]
+    weight = weights(reference.halves)[mask]
     base = {"type": "aniso_pm", "photon_count": 100_000}
     direct = [render(scene, base | {"max_depth": 2}, spp, s)[0][mask].mean() for s in range(seeds)]
     print(
         f"\n{name}: {seeds} seeds, {spp} spp, {mask.mean():.0%} of the pixels show metal; ", end=""
     )
-    print(f"variance of the reference {np.mean(weight * noise[mask] ** 2):.1e}\n")
+    print(
+        f"variance of the reference {np.mean(weight * reference.half_difference[mask] ** 2):.1e}\n"
+    )
     print("| kernel | rule | guard | variance | bias² | energy, indirect | fallbacks |")
     print("|---|---|---|---|---|---|---|")
     isotropic = None
