@@ -70,7 +70,7 @@ def relative_rmse(difference: np.ndarray, reference: np.ndarray) -> float:
 def depends_on(world, sensor) -> dict[str, Any]:
     """What a reference depends on, entry by entry (see ``digest``): the scene, camera and film, the
     colours of the variant, and which paths the scene's own integrator counts."""
-    limits = _limits(world.integrator())
+    limits = path_limits(world.integrator())
     return {
         "colours": "mono" if mi.is_monochromatic else "spectral" if mi.is_spectral else "rgb",
         **{f'parameter "{name}"': value for name, value in limits.items()},
@@ -79,7 +79,7 @@ def depends_on(world, sensor) -> dict[str, Any]:
     }
 
 
-def _limits(integrator) -> dict[str, Any]:
+def path_limits(integrator) -> dict[str, Any]:
     """The longest path and whether emitters are hidden, of any integrator."""
     if hasattr(integrator, "parameters"):
         found = integrator.parameters()
@@ -148,7 +148,7 @@ def grow(
         raise InputError("a reference needs a time or a number of samples per pixel to end at")
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
         raise InputError(f"film {sensor.film().class_name()}: a reference needs an hdrfilm")
-    plugin = _independent(integrator, _limits(world.integrator()))
+    plugin = _independent(integrator, path_limits(world.integrator()))
     fixed = {"integrator": integrator, "seed": seed, "depends_on": depends_on(world, sensor)}
     if start is None:
         before = {"spp": 0, "seconds": 0.0, "waves": 0}

@@ -1,0 +1,74 @@
+"""What is to be run: methods, budgets, seeds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from aniso_pm.errors import InputError
+
+from .methods import QUICK, STANDARD
+
+# Budgets span two decades.
+_SPAN = 100.0
+# Reported seeds are 0, 1, 2, …; everything that is chosen is chosen on other ones.
+SWEEP_SEED, REGION_SEED, WARM_SEED = 1000, 2000, 3000
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The experiment on each scene.
+
+    methods      names, see ``methods``.
+    seconds      largest budget; the smallest is a hundredth of it.
+    budgets      how many, in equal steps of their logarithm.
+    seeds        independent runs of each method; intervals need three.
+    photons      light paths of a pass of the photon mappers.
+    spp          samples per pixel of such a pass.
+    sweep_seeds  runs at each bandwidth of the sweep.
+    fine         try bandwidths in steps of √2, not of 2 only.
+    quick        said on the page.
+
+    Raises InputError for values out of range.
+    """
+
+    methods: tuple[str, ...] = STANDARD
+    seconds: float = 6.0
+    budgets: int = 7
+    seeds: int = 5
+    photons: int = 100_000
+    spp: int = 1
+    sweep_seeds: int = 2
+    fine: bool = True
+    quick: bool = False
+
+    def __post_init__(self):
+        for name, low, high in (
+            ("seconds", 0.1, 1e6),
+            ("budgets", 2, 50),
+            ("seeds", 3, 1000),
+            ("photons", 1000, 2 * 10**8),
+            ("spp", 1, 10**6),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(f"report: {name} is {value}; it must be {low:g} to {high:g}")
+        if not self.methods:
+            raise InputError("report: no methods; name at least one")
+
+    @classmethod
+    def quickly(cls, **changes) -> Plan:
+        """A plan for a look: fewer methods, seeds and budgets, a second at most."""
+        few = {"methods": QUICK, "seconds": 1.0, "budgets": 5, "seeds": 3}
+        return cls(**few | {"sweep_seeds": 1, "fine": False, "quick": True} | changes)
+
+    @property
+    def times(self) -> list[float]:
+        """The budgets in seconds, ascending."""
+        times = np.geomspace(self.seconds / _SPAN, self.seconds, self.budgets)
+        return [float(f"{t:.3g}") for t in times]
+
+    @property
+    def sweep_seconds(self) -> float:
+        """Length of the runs of the sweep."""
+        return float(f"{self.seconds / 5:.3g}")
