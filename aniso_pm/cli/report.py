@@ -27,16 +27,16 @@ def report(
         ),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option("--time", help="Largest budget, seconds (6).")
+        float | None, typer.Option("--time", help="Largest budget, seconds (5).")
     ] = None,
     budgets: Annotated[
         int | None, typer.Option(help="Number of budgets, from a hundredth of it on (7).")
     ] = None,
     seeds: Annotated[int | None, typer.Option(help="Runs of each method (5).")] = None,
     photons: Annotated[
-        int | None, typer.Option(help="Light paths of a pass of a photon mapper (100000).")
+        int | None, typer.Option(help="Light paths of a pass of a photon mapper (250000).")
     ] = None,
-    spp: Annotated[int | None, typer.Option(help="Samples per pixel of such a pass (1).")] = None,
+    spp: Annotated[int | None, typer.Option(help="Samples per pixel of such a pass (8).")] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="A look: one second, 3 seeds, 5 methods.")
     ] = False,

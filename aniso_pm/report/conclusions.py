@@ -15,7 +15,7 @@ _AGAINST_PATH = (regions.WHOLE, regions.CAUSTIC, regions.ANISOTROPIC)
 def conclusions(results: dict[str, Any], scene: dict[str, Any]) -> list[dict[str, Any]]:
     """The ratios of a scene at the largest budget that the reference does not limit (the largest of
     all where it limits all), with ``tally``, how often each verdict was given over the budgets
-    that it does not limit, and ``clear``, their number."""
+    that it does not limit, and ``compared``, their number."""
     labels = {method["name"]: method["label"] for method in scene["methods"]}
     groups: dict[tuple, list] = {}
     for ratio in results["ratios"]:
@@ -32,7 +32,7 @@ def conclusions(results: dict[str, Any], scene: dict[str, Any]) -> list[dict[str
         found.append(
             last
             | {"label": labels[method], "base_label": labels[base]}
-            | {"tally": dict(tally), "clear": len(clear)}
+            | {"tally": dict(tally), "compared": len(clear)}
         )
     order = list(labels)
     return sorted(

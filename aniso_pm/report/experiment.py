@@ -37,7 +37,8 @@ class Measured:
     """All that was measured on one scene.
 
     runs      method → seed → Cell with the arrays of a ``runs.Run``.
-    sweeps    kernel → Cell with ``radius``, ``factor``, ``errors`` (factor → relative MSE).
+    sweeps    kernel → size of passes → Cell with ``radius``, ``factor``, ``errors`` (pairs of a
+              factor and a relative MSE).
     warm      method → record of its warm-up.
     left_out  names of methods that are the isotropic one in this scene.
     failures  (method, seed or None, reason).
@@ -51,7 +52,7 @@ class Measured:
     methods: list[Method]
     left_out: list[str] = field(default_factory=list)
     runs: dict[str, dict[int, Cell]] = field(default_factory=dict)
-    sweeps: dict[str, Cell] = field(default_factory=dict)
+    sweeps: dict[str, dict[str, Cell]] = field(default_factory=dict)
     warm: dict[str, dict[str, Any]] = field(default_factory=dict)
     failures: list[tuple[str, int | None, str]] = field(default_factory=list)
 
@@ -96,14 +97,11 @@ class _Experiment:
         limits = reference.path_limits(integrator)
         # Mitsuba's integrators do not know all of these names at their defaults.
         limits = {k: v for k, v in limits.items() if v not in (-1, False)}
-        self.stage = runs.Stage(
-            world,
-            sensor,
-            {k: v for k, v in own.items() if k not in _OURS},
-            limits,
-            plan.photons,
-            plan.spp,
-        )
+        self.own = {k: v for k, v in own.items() if k not in _OURS}
+        self.stages = {
+            name: runs.Stage(world, sensor, self.own, limits, size.photons, size.spp)
+            for name, size in plan.sizes.items()
+        }
         self.fixed = {
             "scene": _hash(reference.depends_on(world, sensor)),
             "versions": versions(),
@@ -120,8 +118,8 @@ class _Experiment:
         out, plan = self.out, self.plan
         methods = parse_all(plan.methods)
         try:
-            settings = Settings(**{k: v for k, v in self.stage.own.items() if k in _FIELDS})
-            prepared = prepare(self.world, settings, self.stage.own.get("hide_emitters", False))
+            settings = Settings(**{k: v for k, v in self.own.items() if k in _FIELDS})
+            prepared = prepare(self.world, settings, self.own.get("hide_emitters", False))
         except ValueError as error:
             prepared = None
             out.failures += [(m.name, None, one_line(error)) for m in methods if m.ours]
@@ -133,7 +131,8 @@ class _Experiment:
             self._regions(prepared)
         for method in out.methods:
             if method.bandwidth == "best":
-                self._sweep(method)
+                for size in plan.sizes:
+                    self._sweep(method, size)
 
         # --- The runs that are reported ---
         for seed in range(plan.seeds):
@@ -175,29 +174,24 @@ class _Experiment:
             self.out.failures.append(("regions", None, cell.error))
         self.out.masks |= cell.arrays
 
-    def _sweep(self, method: Method) -> None:
-        """Best bandwidth of a kernel."""
-        plan = self.plan
-        budgets = [plan.sweep_seconds]
-        key = {"parameters": self.stage.parameters(method, None), "budgets": budgets}
-        key |= {"seeds": plan.sweep_seeds, "fine": plan.fine, "spp": plan.spp}
+    def _sweep(self, method: Method, size: str) -> None:
+        """Best bandwidth of a kernel with passes of one size."""
+        plan, stage = self.plan, self.stages[size]
+        budgets = [plan.sizes[size].sweep_seconds]
+        key = {"parameters": stage.parameters(method, None), "budgets": budgets}
+        key |= {"seeds": plan.sweep_seeds, "fine": plan.fine, "spp": stage.spp}
 
         def error(automatic: float, factor: float) -> float:
-            images = []
-            for k in range(plan.sweep_seeds):
-                found = runs.run(self.stage, method, factor * automatic, SWEEP_SEED + k, budgets)
-                images.append(found.images[0])
+            seeds = range(SWEEP_SEED, SWEEP_SEED + plan.sweep_seeds)
+            radius = factor * automatic
+            images = [runs.run(stage, method, radius, s, budgets).images[0] for s in seeds]
             self.tick(plan.sweep_seeds * budgets[0], f"{self.out.name}: bandwidth, {method.kernel}")
             table = metrics.products(images, self.out.reference.halves, self.whole, self.weight)
             return metrics.mse(table)
 
         def make():
-            automatic = self._warm(method, None)["radius"]
+            automatic = self._warm(method, stage, None)["radius"]
             factor, errors = sweep.best(partial(error, automatic), plan.fine)
-            if not np.isfinite(errors[factor]):
-                raise RuntimeError(
-                    f"no picture within {budgets[0]:g} s at any bandwidth; raise the time"
-                )
             return {
                 "automatic": automatic,
                 "factor": factor,
@@ -206,25 +200,30 @@ class _Experiment:
                 "errors": [[f, e if np.isfinite(e) else None] for f, e in errors.items()],
             }, {}
 
-        cell = self._cell(f"sweep-{method.slug}", key, make)
+        cell = self._cell(f"sweep-{size}-{method.slug}", key, make)
         if cell.error:
             self.out.failures.append((method.name, None, cell.error))
         else:
-            self.out.sweeps[method.kernel] = cell
+            self.out.sweeps.setdefault(method.kernel, {})[size] = cell
 
     def _run(self, method: Method, seed: int) -> Cell:
-        radius = None
-        if method.bandwidth == "best":
-            if method.kernel not in self.out.sweeps:
-                return Cell({"error": "no best bandwidth was found"}, {})
-            radius = self.out.sweeps[method.kernel].record["radius"]
-        budgets = self.plan.times
-        key = {"parameters": self.stage.parameters(method, radius), "budgets": budgets}
-        key |= {"seed": seed, "spp": self.plan.spp}
+        """One method with one seed at all budgets."""
+        parts = self._parts(method)
+        key = {
+            "seed": seed,
+            "parts": [
+                [stage.parameters(method, radius), stage.spp, times]
+                for stage, radius, times in parts
+            ],
+        }
 
         def make():
-            warm = self._warm(method, radius)
-            found = asdict(runs.run(self.stage, method, radius, seed, budgets))
+            found = None
+            for stage, radius, times in parts:
+                warm = self._warm(method, stage, radius)
+                part = runs.run(stage, method, radius, seed, times)
+                found = part if found is None else runs.joined(found, part)
+            found = asdict(found)
             return found | {"images": None, "warm": warm}, {"images": found["images"]}
 
         cell = self._cell(f"{method.slug}-{seed}", key, make)
@@ -237,11 +236,26 @@ class _Experiment:
         self.tick(self.plan.seconds, f"{self.out.name}: {method.label}, seed {seed}")
         return cell
 
-    def _warm(self, method: Method, radius: float | None) -> dict[str, Any]:
+    def _parts(self, method: Method) -> list[tuple[runs.Stage, float | None, list[float]]]:
+        """The runs that give the pictures of a method: stage, radius (None: automatic), budgets."""
+        if not method.ours:
+            # The size of passes is for the photon mappers.
+            return [(self.stages["large"], None, self.plan.times)]
+        parts = []
+        for name, size in self.plan.sizes.items():
+            radius = None
+            if method.bandwidth == "best":
+                cell = self.out.sweeps.get(method.kernel, {}).get(name)
+                radius = cell.record["radius"] if cell else None
+            parts.append((self.stages[name], radius, size.times))
+        return parts
+
+    def _warm(self, method: Method, stage: runs.Stage, radius: float | None) -> dict[str, Any]:
         """Warm up a method once in this process."""
-        if method.name not in self._warmed:
-            self._warmed[method.name] = runs.warm_up(self.stage, method, radius, WARM_SEED)
-        return self._warmed[method.name]
+        key = method.name, stage.photons
+        if key not in self._warmed:
+            self._warmed[key] = runs.warm_up(stage, method, radius, WARM_SEED)
+        return self._warmed[key]
 
 
 def _same(method: Method, methods: list[Method]) -> bool:

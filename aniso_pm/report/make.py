@@ -130,8 +130,8 @@ def expected_seconds(plan: Plan) -> float:
     methods = parse_all(plan.methods)
     sweeps = sum(method.bandwidth == "best" for method in methods)
     tried = 6 if plan.fine else 4
-    in_sweeps = sweeps * tried * plan.sweep_seeds * plan.sweep_seconds
-    return len(methods) * plan.seeds * plan.seconds + in_sweeps
+    times = sum(size.sweep_seconds for size in plan.sizes.values())
+    return len(methods) * plan.seeds * plan.seconds + sweeps * tried * plan.sweep_seeds * times
 
 
 def _check(files: list[Path], plan: Plan, defines, sensor: int) -> None:

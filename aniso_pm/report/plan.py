@@ -25,7 +25,10 @@ class Plan:
     seeds        independent runs of each method; intervals need three.
     photons      light paths of a pass of the photon mappers.
     spp          samples per pixel of such a pass.
-    sweep_seeds  runs at each bandwidth of the sweep.
+    early        share of the largest budget up to which pictures are taken from another run, whose
+                 passes are an eighth of that: who has less time takes smaller passes.
+    sweep_share  of the largest budget: the time of the runs of a sweep.
+    sweep_seeds  runs at each bandwidth of a sweep.
     fine         try bandwidths in steps of √2, not of 2 only.
     quick        said on the page.
 
@@ -33,11 +36,13 @@ class Plan:
     """
 
     methods: tuple[str, ...] = STANDARD
-    seconds: float = 6.0
+    seconds: float = 5.0
     budgets: int = 7
     seeds: int = 5
-    photons: int = 100_000
-    spp: int = 1
+    photons: int = 250_000
+    spp: int = 8
+    early: float = 0.1
+    sweep_share: float = 0.2
     sweep_seeds: int = 2
     fine: bool = True
     quick: bool = False
@@ -60,7 +65,11 @@ class Plan:
     def quickly(cls, **changes) -> Plan:
         """A plan for a look: fewer methods, seeds and budgets, a second at most."""
         few = {"methods": QUICK, "seconds": 1.0, "budgets": 5, "seeds": 3}
-        return cls(**few | {"sweep_seeds": 1, "fine": False, "quick": True} | changes)
+        return cls(
+            **few
+            | {"sweep_share": 1.0, "sweep_seeds": 1, "fine": False, "early": 0.4, "quick": True}
+            | changes
+        )
 
     @property
     def times(self) -> list[float]:
@@ -69,6 +78,28 @@ class Plan:
         return [float(f"{t:.3g}") for t in times]
 
     @property
-    def sweep_seconds(self) -> float:
-        """Length of the runs of the sweep."""
-        return float(f"{self.seconds / 5:.3g}")
+    def sizes(self) -> dict[str, Size]:
+        """Sizes of passes of the photon mappers, each with the budgets that it is for."""
+        early = [t for t in self.times if t <= self.early * self.seconds]
+        late = [t for t in self.times if t not in early]
+        few, one = max(1, self.photons // 8), max(1, self.spp // 8)
+        found = {
+            "small": Size(few, one, early, self.early * self.seconds),
+            "large": Size(self.photons, self.spp, late, self.sweep_share * self.seconds),
+        }
+        return {name: size for name, size in found.items() if size.times}
+
+
+@dataclass(frozen=True)
+class Size:
+    """Passes of one size.
+
+    photons, spp   light paths and samples per pixel of a pass.
+    times          the budgets that are taken from a run of such passes.
+    sweep_seconds  time of the runs that look for their best bandwidth.
+    """
+
+    photons: int
+    spp: int
+    times: list[float]
+    sweep_seconds: float

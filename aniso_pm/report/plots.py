@@ -11,6 +11,7 @@ from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 # Okabe and Ito's colours, which everybody can tell apart.
 COLOURS = {
@@ -39,8 +40,10 @@ def figures(results: dict[str, Any], scene: dict[str, Any]) -> dict[str, Figure]
         here = [r for r in ratios if r["region"] == region and r["base"].startswith("isotropic")]
         if here:
             found[f"ratio-{region}"] = _ratios(scene, here, region)
-    if scene["sweeps"]:
-        found["bandwidth"] = _sweeps(scene)
+    for size in results["plan"]["sizes"]:
+        sweeps = {kernel: of[size] for kernel, of in scene["sweeps"].items() if size in of}
+        if sweeps:
+            found[f"bandwidth-{size}"] = _sweeps(sweeps, size)
     return found
 
 
@@ -49,6 +52,8 @@ def _errors(scene, rows, region) -> Figure:
     for method in scene["methods"]:
         mine = [row for row in rows if row["method"] == method["name"]]
         _curve(ax, method, _colour(scene, method), mine)
+    ax.xaxis.set_major_formatter("{x:.3g}")
+    ax.xaxis.set_minor_formatter(NullFormatter())
     ax.axhline(scene["reference"]["relative_mse"][region], color="0.6", lw=1)
     ax.annotate(
         "reference's own error",
@@ -100,6 +105,9 @@ def _ratios(scene, ratios, region) -> Figure:
     figure, ax = _axes("seconds", "error / isotropic error", f"Equal time: {region} pixels")
     ax.set_yscale("log", base=2)
     ax.axhline(1, color="0.5", lw=1)
+    values = [r["value"] for r in ratios if r["value"] is not None]
+    # Wide intervals may leave the picture; no ratio does.
+    ax.set_ylim(min([0.5, *values]) / 1.2, max([2.0, *values]) * 1.2)
     shift = 0.94
     for method in scene["methods"]:
         mine = [r for r in ratios if r["method"] == method["name"] and r["value"] is not None]
@@ -117,18 +125,20 @@ def _ratios(scene, ratios, region) -> Figure:
             ax.plot(a, b, mark, color=colour, mfc="white" if r["limited"] else colour, ms=5)
         ax.plot([], [], mark + line, color=colour, label=method["label"], ms=5)
     ax.yaxis.set_major_formatter("{x:.3g}")
+    ax.xaxis.set_major_formatter("{x:.3g}")
+    ax.xaxis.set_minor_formatter(NullFormatter())
     _legend(ax)
     return figure
 
 
-def _sweeps(scene) -> Figure:
-    seconds = next(iter(scene["sweeps"].values()))["seconds"]
+def _sweeps(sweeps, size) -> Figure:
+    seconds = next(iter(sweeps.values()))["seconds"]
     figure, ax = _axes(
         "bandwidth of the first pass / automatic one",
         "relative MSE",
-        f"Error against bandwidth after {seconds:g} s",
+        f"Error against bandwidth after {seconds:g} s, {size} passes",
     )
-    for kernel, sweep in scene["sweeps"].items():
+    for kernel, sweep in sweeps.items():
         points = [(factor, error) for factor, error in sweep["errors"] if error and error > 0]
         if not points:
             continue

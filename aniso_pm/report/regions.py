@@ -20,7 +20,7 @@ DEFINITIONS = {
     "caustic photon map: light that came over glass, mirrors or glossy metal to a diffuse surface",
 }
 # A region of fewer pixels is left out: its means would say nothing.
-MIN_PIXELS = 50
+MIN_PIXELS = 30
 _SPP, _PHOTONS = 16, 400_000
 
 

@@ -19,7 +19,8 @@ SCHEMA = 1
 
 def table(parts: list[dict[str, Any]], plan: Plan, about: dict[str, Any]) -> dict[str, Any]:
     """All scenes together, see the schema. parts: of :func:`of_scene`."""
-    planned = asdict(plan) | {"times": plan.times, "sweep_seconds": plan.sweep_seconds}
+    sizes = {name: asdict(size) for name, size in plan.sizes.items()}
+    planned = asdict(plan) | {"times": plan.times, "sizes": sizes}
     scenes = [{k: v for k, v in p.items() if k not in ("rows", "ratios")} for p in parts]
     both = {name: [entry for part in parts for entry in part[name]] for name in ("rows", "ratios")}
     return output.plain({"schema": SCHEMA, **about, "plan": planned, "scenes": scenes, **both})
@@ -73,8 +74,8 @@ def of_scene(measured: Measured, plan: Plan) -> dict[str, Any]:
         "methods": [_method(measured, method) for method in made],
         "left_out": measured.left_out,
         "sweeps": {
-            kernel: {k: v for k, v in cell.record.items() if k != "error"}
-            for kernel, cell in measured.sweeps.items()
+            kernel: {size: cell.record for size, cell in cells.items()}
+            for kernel, cells in measured.sweeps.items()
         },
         "failures": [
             {"method": name, "seed": seed, "reason": reason}

@@ -46,6 +46,12 @@ class Run:
     stages: dict[str, float] = field(default_factory=dict)
     radius: float | None = None
 
+    @classmethod
+    def without_pictures(cls, budgets: int, shape: tuple[int, ...]) -> Run:
+        """To begin with. shape: of a picture."""
+        images = np.full((budgets, *shape), np.nan, np.float32)
+        return cls(images, [float("nan")] * budgets, [0] * budgets, [0] * budgets)
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -58,6 +64,12 @@ class Stage:
     photons: int
     spp: int  # samples per pixel of a pass
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of a picture."""
+        width, height = self.sensor.film().crop_size()
+        return height, width, 3
+
     def parameters(self, method: Method, radius: float | None) -> dict[str, Any]:
         """The plugin's parameters in this scene. radius: of the first pass, None: by default."""
         if not method.ours:
@@ -67,13 +79,24 @@ class Stage:
         return self.own | self.limits | method.plugin | passes | bandwidth
 
 
+def joined(first: Run, second: Run) -> Run:
+    """Pictures of two runs with ascending budgets; stages and radius are those of the second."""
+    return Run(
+        np.concatenate([first.images, second.images]),
+        first.seconds + second.seconds,
+        first.passes + second.passes,
+        first.spp + second.spp,
+        second.stages,
+        second.radius,
+    )
+
+
 def run(stage: Stage, method: Method, radius: float | None, seed: int, budgets: list[float]) -> Run:
     """Run ``method`` once. radius: bandwidth of the first pass; None lets the pilot choose.
 
     budgets  seconds, ascending.
     """
-    width, height = stage.sensor.film().crop_size()
-    recorder = _Recorder(budgets, (height, width, 3))
+    recorder = _Recorder(budgets, stage.shape)
     parameters = stage.parameters(method, radius)
     (_passes if method.ours else _calls)(stage, parameters, seed, recorder)
     return recorder.run
@@ -84,9 +107,7 @@ class _Recorder:
 
     def __init__(self, budgets: list[float], shape: tuple[int, ...]):
         self.budgets = budgets
-        count = len(budgets)
-        nothing = np.full((count, *shape), np.nan, np.float32)
-        self.run = Run(nothing, [float("nan")] * count, [0] * count, [0] * count)
+        self.run = Run.without_pictures(len(budgets), shape)
 
     def add(self, image, stages: dict[str, float], passes: int, spp: int) -> bool:
         """Note a finished picture (y, x, 3 or more). Returns whether time is up."""
