@@ -24,6 +24,7 @@ import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
 from aniso_pm.report import reference as references
+from aniso_pm.report.metrics import weights
 from make_pictures import HERE
 
 # What is looked at: left, top, width, height in pixels of the reference.
@@ -101,13 +102,6 @@ def products(images, halves):
     scale = weights(halves) ** 0.5
     first, second = (by_block(scale * (images - half)) for half in halves)
     return first @ second.transpose(0, 2, 1) / first.shape[-1]
-
-
-def weights(halves):
-    """1/(R² + 0.01) of each pixel and colour, see above."""
-    level = np.pad(halves[0] * halves[1], ((1, 1), (1, 1), (0, 0)), mode="edge")
-    level = np.lib.stride_tricks.sliding_window_view(level, (3, 3), (0, 1)).mean((-1, -2))
-    return 1 / (np.maximum(level, 0) + 0.01)
 
 
 def by_block(values):

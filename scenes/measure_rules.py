@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm.report import reference as references
+from aniso_pm.report.metrics import weights
 from make_pictures import HERE, SCENES, render
-from measure_convergence import weights
 
 KERNELS = [("isotropic", "lobe", True)] + [
     ("anisotropic", rule, guard) for rule in ("lobe", "taylor", "paper") for guard in (True, False)

@@ -55,7 +55,7 @@ SCENE = """<scene version="3.0.0">
   </shape>
 </scene>
 """
-QUICK = ("--quick", "--time", "0.4", "--photons", "3000")
+QUICK = ("--quick", "--time", "0.4", "--photons", "3000", "--spp", "1")
 
 
 @pytest.fixture(autouse=True)
@@ -187,6 +187,21 @@ def test_cells_of_another_plan_do_not_count(tmp_path):
     assert store.get("a", {"seed": 1}).arrays["image"].tolist() == [1, 1, 1]
     store.put("b", {}, {"error": "no"})
     assert store.get("b", {}) is None
+
+
+def test_interrupted_reports_keep_what_is_done(scene, tmp_path, monkeypatch, capfd):
+    run = runs.run
+
+    def interrupted(stage, method, radius, seed, budgets):
+        if seed == 1:
+            raise KeyboardInterrupt
+        return run(stage, method, radius, seed, budgets)
+
+    monkeypatch.setattr(runs, "run", interrupted)
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *QUICK, "--method", "path"]) == 130
+    assert "goes on from here" in capfd.readouterr().err
+    assert (tmp_path / "cells/tiny/path-0.npz").exists()
+    assert not (tmp_path / "cells/tiny/path-1.npz").exists()
 
 
 # --- Wrong input ---

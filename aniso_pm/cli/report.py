@@ -8,10 +8,18 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from aniso_pm.errors import InputError
+from aniso_pm.errors import InputError, is_interrupt
 from aniso_pm.progress import shown
 
-from .common import Define, Variant, make_directory, mitsuba_log, parse_defines, set_variant
+from .common import (
+    INTERRUPTED,
+    Define,
+    Variant,
+    make_directory,
+    mitsuba_log,
+    parse_defines,
+    set_variant,
+)
 
 
 def report(
@@ -38,7 +46,7 @@ def report(
     ] = None,
     spp: Annotated[int | None, typer.Option(help="Samples per pixel of such a pass (8).")] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="A look: one second, 3 seeds, 5 methods.")
+        bool, typer.Option("--quick", help="A look: half a second, 3 seeds, 5 methods.")
     ] = False,
     variant: Variant = "llvm_ad_rgb",
     define: Define = None,
@@ -83,7 +91,13 @@ def report(
         mitsuba_log(quiet),
         shown(unit="s", disable=not visible, file=sys.stderr, leave=False) as show,
     ):
-        made = make.report(scenes, out, plan, parse_defines(define or []), sensor, show)
+        try:
+            made = make.report(scenes, out, plan, parse_defines(define or []), sensor, show)
+        except BaseException as error:
+            if not is_interrupt(error):
+                raise
+            print("aniso-pm: interrupted; the same command goes on from here", file=sys.stderr)
+            return INTERRUPTED
     if made.stale and not quiet:
         print(
             f"aniso-pm: {len(made.stale)} kept runs were of another scene, plan, version or "

@@ -32,6 +32,7 @@ def conclusions(results: dict[str, Any], scene: dict[str, Any]) -> list[dict[str
         found.append(
             last
             | {"label": labels[method], "base_label": labels[base]}
+            | {"base_kernel": base.partition("/")[0]}
             | {"tally": dict(tally), "compared": len(clear)}
         )
     order = list(labels)

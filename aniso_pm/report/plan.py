@@ -54,6 +54,7 @@ class Plan:
             ("seeds", 3, 1000),
             ("photons", 1000, 2 * 10**8),
             ("spp", 1, 10**6),
+            ("early", 0, 0.99),
         ):
             value = getattr(self, name)
             if not low <= value <= high:
@@ -63,13 +64,11 @@ class Plan:
 
     @classmethod
     def quickly(cls, **changes) -> Plan:
-        """A plan for a look: fewer methods, seeds and budgets, a second at most."""
-        few = {"methods": QUICK, "seconds": 1.0, "budgets": 5, "seeds": 3}
-        return cls(
-            **few
-            | {"sweep_share": 1.0, "sweep_seeds": 1, "fine": False, "early": 0.4, "quick": True}
-            | changes
-        )
+        """A plan for a look: fewer methods, seeds and budgets, shorter runs, smaller passes."""
+        few = {"methods": QUICK, "seconds": 0.6, "budgets": 5, "seeds": 3}
+        few |= {"photons": 60_000, "spp": 2, "early": 0.0}
+        few |= {"sweep_share": 1.0, "sweep_seeds": 1, "fine": False, "quick": True}
+        return cls(**few | changes)
 
     @property
     def times(self) -> list[float]:

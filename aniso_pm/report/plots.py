@@ -11,7 +11,7 @@ from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import NullLocator
 
 # Okabe and Ito's colours, which everybody can tell apart.
 COLOURS = {
@@ -52,8 +52,7 @@ def _errors(scene, rows, region) -> Figure:
     for method in scene["methods"]:
         mine = [row for row in rows if row["method"] == method["name"]]
         _curve(ax, method, _colour(scene, method), mine)
-    ax.xaxis.set_major_formatter("{x:.3g}")
-    ax.xaxis.set_minor_formatter(NullFormatter())
+    _budgets(ax, rows)
     ax.axhline(scene["reference"]["relative_mse"][region], color="0.6", lw=1)
     ax.annotate(
         "reference's own error",
@@ -63,7 +62,7 @@ def _errors(scene, rows, region) -> Figure:
         fontsize=7,
         color="0.4",
     )
-    _legend(ax)
+    _legend(figure)
     return figure
 
 
@@ -96,7 +95,7 @@ def _split(scene, rows, region) -> Figure:
     ax.set_ylim(len(methods) - 0.5, -0.5)
     ax.plot([], [], "|", color="0.3", ms=9, label="variance")
     ax.plot([], [], "o", color="0.3", label="bias²")
-    _legend(ax)
+    _legend(figure)
     return figure
 
 
@@ -125,9 +124,8 @@ def _ratios(scene, ratios, region) -> Figure:
             ax.plot(a, b, mark, color=colour, mfc="white" if r["limited"] else colour, ms=5)
         ax.plot([], [], mark + line, color=colour, label=method["label"], ms=5)
     ax.yaxis.set_major_formatter("{x:.3g}")
-    ax.xaxis.set_major_formatter("{x:.3g}")
-    ax.xaxis.set_minor_formatter(NullFormatter())
-    _legend(ax)
+    _budgets(ax, ratios)
+    _legend(figure)
     return figure
 
 
@@ -147,7 +145,7 @@ def _sweeps(sweeps, size) -> Figure:
         ax.plot(*next(p for p in points if p[0] == sweep["factor"]), "*", color=colour, ms=13)
     ax.set_xscale("log", base=2)
     ax.xaxis.set_major_formatter("{x:.3g}")
-    _legend(ax)
+    _legend(figure)
     return figure
 
 
@@ -192,9 +190,16 @@ def _colour(scene, method) -> str:
     return _MORE[others.index(method["name"]) % len(_MORE)]
 
 
-def _legend(ax) -> None:
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=7, frameon=False, handlelength=2.6, labelspacing=0.3)
+def _budgets(ax, entries) -> None:
+    """Ticks where the budgets are."""
+    budgets = sorted({entry["budget"] for entry in entries})
+    ax.set_xticks(budgets, [f"{b:.2g}" for b in budgets], minor=False)
+    ax.xaxis.set_minor_locator(NullLocator())
+
+
+def _legend(figure) -> None:
+    """Below the axes, where it hides nothing."""
+    figure.legend(loc="outside lower center", ncols=2, fontsize=7, frameon=False, handlelength=2.6)
 
 
 def as_bytes(figure: Figure, kind: str) -> bytes:

@@ -23,6 +23,8 @@ from .methods import Method
 
 # Samples per pixel of one call of Mitsuba's integrators: each number compiles kernels of its own.
 CALLS = (1, 4, 16, 64)
+# No call of more than one sample begins if it would not end in time, were it so much slower.
+_MARGIN = 1.25
 # Passes of a warm-up: buffers have found their size after the second.
 _WARM_PASSES = 6
 
@@ -171,7 +173,7 @@ def _samples(took: dict[int, float], left: float) -> int:
     for smaller, count in zip(CALLS, CALLS[1:], strict=False):
         # Nobody knows yet how long so many take: at most in proportion.
         known = took.get(count, took.get(smaller, float("inf")) * count / smaller)
-        if known > left:
+        if _MARGIN * known > left:
             break
         best = count
     return best
