@@ -153,6 +153,7 @@ def test_wheel_and_sdist_contain_the_plugins(built):
     names = zipfile.ZipFile(wheel).namelist()
     assert {"aniso_pm/plugins/__init__.py", "aniso_pm/py.typed"} <= set(names)
     assert {f"aniso_pm/stability/page.{kind}.j2" for kind in ("html", "md")} <= set(names)
+    assert {"aniso_pm/report/page.html.j2", "aniso_pm/report/results.schema.json"} <= set(names)
     with tarfile.open(sdist) as archive:
         assert any(name.endswith("/plugins/__init__.py") for name in archive.getnames())
 
