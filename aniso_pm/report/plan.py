@@ -55,6 +55,8 @@ class Plan:
             ("photons", 1000, 2 * 10**8),
             ("spp", 1, 10**6),
             ("early", 0, 0.99),
+            ("sweep_share", 0.01, 1),
+            ("sweep_seeds", 2, 1000),
         ):
             value = getattr(self, name)
             if not low <= value <= high:
@@ -67,7 +69,7 @@ class Plan:
         """A plan for a look: fewer methods, seeds and budgets, shorter runs, smaller passes."""
         few = {"methods": QUICK, "seconds": 0.6, "budgets": 5, "seeds": 3}
         few |= {"photons": 60_000, "spp": 2, "early": 0.0}
-        few |= {"sweep_share": 1.0, "sweep_seeds": 1, "fine": False, "quick": True}
+        few |= {"sweep_share": 0.6, "fine": False, "quick": True}
         return cls(**few | changes)
 
     @property

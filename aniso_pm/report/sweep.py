@@ -2,7 +2,7 @@
 
 Radii are multiples of the automatic radius. From 1 and 1/2 the search goes on in factors of 2
 towards smaller errors until they grow again, then tries √2 to both sides of the best. "Best" is
-the smallest relative MSE at the end of a run of a given time; it holds for that time and scene.
+the smallest relative MSE after a given time; it holds for that time and scene.
 """
 
 from __future__ import annotations
