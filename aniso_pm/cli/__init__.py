@@ -16,7 +16,7 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import InputError, is_interrupt, one_line
 
-from . import examine, reference, render
+from . import examine, reference, render, scenes
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -78,6 +78,7 @@ for command in (
     render.render,
     render.merge,
     reference.reference,
+    scenes.scenes,
     examine.inspect,
     examine.stability,
     examine.doctor,
