@@ -16,7 +16,7 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import InputError, is_interrupt, one_line
 
-from . import examine, reference, render, report
+from . import examine, reference, render, report, scenes
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -79,6 +79,7 @@ for command in (
     render.merge,
     reference.reference,
     report.report,
+    scenes.scenes,
     examine.inspect,
     examine.stability,
     examine.doctor,

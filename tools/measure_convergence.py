@@ -1,4 +1,4 @@
-"""Error against passes: ``python scenes/measure_convergence.py`` makes pictures/convergence.svg.
+"""Error against passes: ``python tools/measure_convergence.py``.
 
 Each scene is rendered with several seeds in small passes, and the picture is kept after 1, 4, 16, …
 passes. Errors count relative to R² + 0.01; R² is the mean of R1 R2 over 3 × 3 pixels of the two
@@ -13,7 +13,8 @@ scatters is shown by a bootstrap over seeds and blocks of pixels: 95 % intervals
 three of its standard errors of zero cannot be told from the reference's noise; it is drawn hollow
 and does not count for the slope.
 
-Needs matplotlib, which the extra ``dev`` brings.
+Writes ``scenes/pictures/convergence.svg`` and ``.json``. Needs matplotlib, which the extra ``dev``
+brings.
 """
 
 import argparse
@@ -25,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 from aniso_pm.report import reference as references
 from aniso_pm.report.metrics import weights
-from make_pictures import HERE
+from make_pictures import SCENES
 
 # What is looked at: left, top, width, height in pixels of the reference.
 WINDOWS = {
@@ -69,14 +70,14 @@ class Curve:
 
 def load(name):
     """Scene with the window as its crop window, and the reference's halves there."""
-    scene = mi.load_file(str(HERE / f"{name}.xml"), optimize=False)
+    scene = mi.load_file(str(SCENES / f"{name}.xml"), optimize=False)
     left, top, width, height = WINDOWS[name]
     sensor = scene.sensors()[0]
     parameters = mi.traverse(sensor)
     parameters["film.crop_offset"] = [left, top]
     parameters["film.crop_size"] = [width, height]
     parameters.update()
-    reference = references.read(HERE / "references" / f"{name}.exr")
+    reference = references.read(SCENES / "references" / f"{name}.exr")
     rows, columns = slice(top, top + height), slice(left, left + width)
     halves = [half[rows, columns] for half in reference.halves]
     return scene, halves
@@ -229,7 +230,7 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     # Scenes that are not measured now keep what was measured before.
-    file = HERE / "pictures" / "convergence.json"
+    file = SCENES / "pictures" / "convergence.json"
     measured = json.loads(file.read_text()) if file.exists() else {}
     measured |= run(arguments.scenes, arguments.photons, arguments.spp)
     file.write_text(json.dumps(measured, indent=1, ensure_ascii=False) + "\n")

@@ -1,4 +1,4 @@
-"""What rule and guard do to the metal of the two scenes: ``python scenes/measure_rules.py``.
+"""What rule and guard do to the metal of the two scenes: ``python tools/measure_rules.py``.
 
 One pass at the automatic bandwidth, every kernel with the same photons and the same eye paths,
 over several seeds. For the pixels that show metal, relative to R² + 0.01: variance, bias² (product
@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from aniso_pm.report import reference as references
 from aniso_pm.report.metrics import weights
-from make_pictures import HERE, SCENES, render
+from make_pictures import CLOSE_UPS, SCENES, render
 
 KERNELS = [("isotropic", "lobe", True)] + [
     ("anisotropic", rule, guard) for rule in ("lobe", "taylor", "paper") for guard in (True, False)
@@ -34,9 +34,9 @@ def metal_pixels(scene):
 
 
 def measure(name, seeds, spp):
-    scene = mi.load_file(str(HERE / f"{name}.xml"))
+    scene = mi.load_file(str(SCENES / f"{name}.xml"))
     mask = metal_pixels(scene)
-    reference = references.read(HERE / "references" / f"{name}.exr")
+    reference = references.read(SCENES / "references" / f"{name}.exr")
     first, second = (half[mask] for half in reference.halves)
     # Not 1/(R² + 0.01) of the same noisy pixel: its error would weigh itself.
     weight = weights(reference.halves)[mask]
@@ -82,5 +82,5 @@ if __name__ == "__main__":
     parser.add_argument("--spp", type=int, default=16)
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    for scene_name in SCENES:
+    for scene_name in CLOSE_UPS:
         measure(scene_name, arguments.seeds, arguments.spp)

@@ -1,4 +1,4 @@
-"""Render the pictures of the README: ``python scenes/make_pictures.py``.
+"""Render the pictures of the README: ``python tools/make_pictures.py``.
 
 Renders both scenes with ``aniso_pm``, compares with their references, prints a table and writes
 ``scenes/pictures``. Needs matplotlib, which the extra ``dev`` brings.
@@ -12,9 +12,9 @@ import numpy as np
 from aniso_pm.report import reference as references
 from aniso_pm.report.reference import relative_rmse
 
-HERE = Path(__file__).resolve().parent
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
 # The close-up of each scene: left, top, right, bottom in pixels.
-SCENES = {"teapot": (165, 230, 325, 350), "fry_pan": (60, 90, 260, 240)}
+CLOSE_UPS = {"teapot": (165, 230, 325, 350), "fry_pan": (60, 90, 260, 240)}
 
 
 def render(scene, integrator, spp, seed):
@@ -36,9 +36,9 @@ def make_pictures():
     figure, axes = plt.subplots(
         4, 3, figsize=(12, 13.4), height_ratios=[3, 2.25, 3, 2.25], dpi=100, facecolor="white"
     )
-    for row, name in enumerate(SCENES):
-        scene = mi.load_file(str(HERE / f"{name}.xml"))
-        compared = references.read(HERE / "references" / f"{name}.exr")
+    for row, name in enumerate(CLOSE_UPS):
+        scene = mi.load_file(str(SCENES / f"{name}.xml"))
+        compared = references.read(SCENES / "references" / f"{name}.exr")
         reference = compared.mean
         columns = []
         for kernel in ("isotropic", "anisotropic"):
@@ -53,12 +53,12 @@ def make_pictures():
                 f"radius {plugin.statistics['initial_radius']:.3f}"
             )
             if kernel == "anisotropic":
-                picture = HERE / "pictures" / f"{name}.png"
+                picture = SCENES / "pictures" / f"{name}.png"
                 mi.util.write_bitmap(str(picture), mi.TensorXf(image.astype(np.float32)))
         own = compared.own_error
         columns.append((f"path, reference (own error {100 * own:.1f} %)", reference))
         print(f"{name}: error of the reference itself {own:.4f}")
-        left, top, right, bottom = SCENES[name]
+        left, top, right, bottom = CLOSE_UPS[name]
         for column, (title, image) in enumerate(columns):
             shown = srgb(image)
             axes[2 * row, column].imshow(shown)
@@ -67,7 +67,7 @@ def make_pictures():
     for ax in axes.flat:
         ax.set_axis_off()
     figure.tight_layout(pad=0.4)
-    figure.savefig(HERE / "pictures" / "comparison.png", dpi=100, pil_kwargs={"optimize": True})
+    figure.savefig(SCENES / "pictures" / "comparison.png", dpi=100, pil_kwargs={"optimize": True})
 
 
 if __name__ == "__main__":
