@@ -23,7 +23,7 @@ CAPTIONS = {
     "and bias², which they do not. Bars: 95 % intervals.",
     "ratio": "Error over that of the isotropic kernel after the same time, at the same kind of "
     "bandwidth, with the same photons and eye paths: below 1 the anisotropic kernel wins.",
-    "bandwidth": "Relative MSE after one short run at each bandwidth, on seeds that are not "
+    "bandwidth": "Relative MSE after short runs at each bandwidth, on seeds that are not "
     "reported. The star is the best bandwidth.",
 }
 

@@ -52,7 +52,7 @@ def _errors(scene, rows, region) -> Figure:
     for method in scene["methods"]:
         mine = [row for row in rows if row["method"] == method["name"]]
         _curve(ax, method, _colour(scene, method), mine)
-    _budgets(ax, rows)
+    _budgets(ax, [row for row in rows if row["relative_mse"]["value"]])
     ax.axhline(scene["reference"]["relative_mse"][region], color="0.6", lw=1)
     ax.annotate(
         "reference's own error",
@@ -195,6 +195,7 @@ def _budgets(ax, entries) -> None:
     budgets = sorted({entry["budget"] for entry in entries})
     ax.set_xticks(budgets, [f"{b:.2g}" for b in budgets], minor=False)
     ax.xaxis.set_minor_locator(NullLocator())
+    ax.set_xlim(budgets[0] * 0.75, budgets[-1] * 1.25)
 
 
 def _legend(figure) -> None:
