@@ -132,6 +132,31 @@ def test_page_needs_no_other_file_and_shows_every_figure(done):
     assert text.count("data:image/svg+xml") == len(svgs)
 
 
+@pytest.mark.slow
+def test_running_it_twice_gives_the_same_ratios_within_their_intervals(scene, done, tmp_path):
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *QUICK]) == 0
+
+    def ratios(out):
+        return {
+            (r["method"], r["base"], r["region"], r["budget"]): r
+            for r in results(out)["ratios"]
+            if r["low"] is not None
+        }
+
+    first, second = ratios(done), ratios(tmp_path)
+    both = first.keys() & second.keys()
+    assert len(both) >= 20
+    # Each interval has 95 %: two of them miss each other more rarely still.
+    apart = [
+        key
+        for key in both
+        if first[key]["high"] < second[key]["low"] or second[key]["high"] < first[key]["low"]
+    ]
+    assert len(apart) <= 0.05 * len(both), apart
+    verdicts = {(first[key]["verdict"], second[key]["verdict"]) for key in both}
+    assert not verdicts & {("better", "worse"), ("worse", "better")}
+
+
 # --- Going on, failing ---
 
 
