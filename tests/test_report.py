@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from importlib import resources
 
 import aniso_pm  # noqa: F401
@@ -251,6 +252,12 @@ def test_wrong_input_is_said_in_one_line_before_anything_runs(
     error = capfd.readouterr().err
     assert words in error and error.count("\n") == 1
     assert not (tmp_path / "results.json").exists()
+
+
+def test_a_missing_package_is_named_with_its_remedy(scene, tmp_path, monkeypatch, capfd):
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    assert cli.main(["report", str(scene), "-o", str(tmp_path)]) == 2
+    assert "pip install 'aniso-pm[report]'" in capfd.readouterr().err
 
 
 def test_names_stand_for_methods():
