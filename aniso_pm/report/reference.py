@@ -155,7 +155,7 @@ def grow(
     plugin = _independent(integrator, _limits(world.integrator()))
     fixed = {"integrator": integrator, "seed": seed, "depends_on": depends_on(world, sensor)}
     if start is None:
-        before = {"spp": 0, "seconds": 0.0, "waves": 0}
+        before: dict[str, Any] = {"spp": 0, "seconds": 0.0, "waves": 0}
     else:
         before = start.record
         _check_same(start, fixed)
