@@ -92,7 +92,7 @@ def bars():
     columns.append((f"path, reference (own error {100 * own:.1f} %)", compared.mean))
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.4), dpi=100, facecolor="white")
     for ax, (title, image) in zip(axes, columns, strict=True):
-        ax.imshow(srgb(3 * image), interpolation="nearest")
+        ax.imshow(srgb(2.5 * image), interpolation="nearest")
         ax.set_title(title, fontsize=11)
         ax.set_axis_off()
     figure.tight_layout(pad=0.4)
