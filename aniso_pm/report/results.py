@@ -161,7 +161,7 @@ def _method(measured: Measured, method: Method) -> dict[str, Any]:
     passes = [cell.record["passes"][-1] for cell in cells]
     stages = [cell.record["stages"] for cell in cells]
     per_pass = {
-        stage: float(np.mean([s[stage] / n for s, n in zip(stages, passes, strict=True) if n]))
+        stage: float(np.median([s[stage] / n for s, n in zip(stages, passes, strict=True) if n]))
         for stage in stages[0]
         if stage not in SET_UP and all(passes)
     }
@@ -172,7 +172,7 @@ def _method(measured: Measured, method: Method) -> dict[str, Any]:
         "bandwidth": method.bandwidth,
         "radius": cells[0].record["radius"],
         "compile_seconds": measured.warm[method.name]["compile_seconds"],
-        "setup_seconds": float(np.mean([sum(s.get(n, 0.0) for n in SET_UP) for s in stages])),
+        "setup_seconds": float(np.median([sum(s.get(n, 0.0) for n in SET_UP) for s in stages])),
         "pass_seconds": per_pass,
         "cost": _cost(measured, method),
     }
