@@ -13,7 +13,7 @@ import pytest
 from aniso_pm import cli, density
 from aniso_pm.errors import InputError
 from aniso_pm.prepared import prepare
-from aniso_pm.report import cells, make, methods, metrics, reference, regions, runs
+from aniso_pm.report import cells, experiment, make, methods, metrics, reference, regions, runs
 from aniso_pm.report.plan import Plan
 from aniso_pm.settings import Settings
 from rooms import room, room_with_ball, room_with_plate
@@ -204,6 +204,20 @@ def test_a_cell_that_fails_does_not_take_the_others_with_it(scene, tmp_path, mon
     monkeypatch.setattr(runs, "run", run)
     assert cli.main(arguments) == 0
     assert {row["seeds"] for row in results(tmp_path)["rows"]} == {4}
+
+
+def test_a_scene_that_is_not_for_photons_is_still_rendered_by_path(scene, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise ValueError("aniso_pm: fog is not supported")
+
+    monkeypatch.setattr(experiment, "prepare", refuse)
+    names = ("--method", "path", "--method", "lobe/default", "--budgets", "2")
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *QUICK, *names]) == 1
+    found = results(tmp_path)
+    assert {row["method"] for row in found["rows"]} == {"path"}
+    (failure,) = found["scenes"][0]["failures"]
+    assert failure["method"] == "lobe/default" and "fog" in failure["reason"]
+    assert "fog is not supported" in (tmp_path / "index.html").read_text()
 
 
 def test_cells_of_another_plan_do_not_count(tmp_path):
