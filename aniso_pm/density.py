@@ -26,6 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import index as spatial
+from . import summed
 from .eye import GatherPoints
 from .kernel import PlaneKernel, disc, guarded_axes
 from .photons import (
@@ -120,6 +121,7 @@ def estimate(
     max_depth,
     active,
     surface=None,
+    tolerance: float = 0,
 ):
     """(reflected radiance, photons inside the kernel) of each gather point, edges not yet
     compensated.
@@ -127,18 +129,20 @@ def estimate(
     max_depth  path segments of camera and light path together, or 0 for no limit (or none that
                the map does not already keep).
     surface    Surface of receivers that are not Lambertian.
+    tolerance  of the sum, relative to the flux in the kernel, if the map has sums; see ``summed``.
     """
     ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
     n = mi.Vector3f(points.n)
     allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
+    caustics_only = points.caustic
 
     def visit(total, slot, word, rho2, inside):
         reflected, missing, count = total
         inside &= faces(word, n)
         if max_depth:
             inside &= segments(word) <= allowed
-        if points.caustic is not None:
-            inside &= is_caustic(word) | ~points.caustic
+        if caustics_only is not None:
+            inside &= is_caustic(word) | ~caustics_only
         light = photon_flux(photons, slot, inside) * dr.select(inside, dr.exp(-rho2), 0)
         if surface is not None:
             light *= surface.brdf(photon_direction(photons, slot, inside), inside)
@@ -148,8 +152,25 @@ def estimate(
         sum_ = reflected + term
         return sum_, (sum_ - reflected) - term, count + dr.select(inside, mi.UInt32(1), 0)
 
+    def visit_node(total, node):
+        reflected, missing, count = total
+        limit = allowed if max_depth else None
+        light, inside, taken = summed.weighed(
+            photons.sums, node, ellipses, CUT2, n, tolerance, limit, caustics_only
+        )
+        term = light - missing
+        sum_ = reflected + term
+        return (
+            (sum_, (sum_ - reflected) - term, count + photons.index.points_in(node, inside)),
+            taken,
+        )
+
+    # Where photons bring directions, a sum over them says nothing.
+    whole = None
+    if photons.sums is not None and surface is None:
+        whole = 0.5 * tolerance, math.exp(-CUT2), visit_node
     total = (mi.Spectrum(0), mi.Spectrum(0), mi.UInt32(0))
-    reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active)
+    reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active, whole)
     area = dr.pi * dr.sqrt(dr.squared_norm(kernel.s)) * dr.sqrt(dr.squared_norm(kernel.t))
     return points.weight * reflected / (area * (KERNEL_MASS * photons.emitted)), count
 

@@ -70,6 +70,14 @@ class Index:
     boxes: Any
     extent: Any
 
+    def points_in(self, node, active):
+        """Number of points below a node; 0 where it is not active."""
+        n_leaves, count = dr.opaque(mi.UInt32, self.n_leaves), dr.opaque(mi.UInt32, self.count)
+        height = dr.lzcnt(node) - dr.lzcnt(n_leaves)
+        first = LEAF * ((node << height) - n_leaves)
+        number = dr.minimum(LEAF << height, count - first)
+        return dr.select(active, number, 0)
+
 
 def curve_order(positions):
     """Permutation (UInt32) that sorts points along a Hilbert curve through them."""
@@ -202,12 +210,17 @@ def _spread(x):
 
 
 @dr.syntax
-def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active):
+def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, whole=None):
     """Fold ``visit`` over all points inside each lane's ellipse.
 
     visit(total, slot, word, rho2, inside) -> total is called with the slot of a point, its word,
     ρ² = (a·d)² + (b·d)² and whether it is inside (it is not in slots without a point); ``total`` is
     any tree of Dr.Jit arrays.
+
+    whole  None, or (tolerance, rim, visit_node): nodes within the thickness of the cylinder whose
+           half extents x, y in units of 1/|a|, 1/|b| have x² + y² <= tolerance (x² + y² + rim, if
+           the rim goes through them) are offered to visit_node(total, node) -> (total, taken), and
+           only opened if they are not taken.
 
     Lanes that lie next to each other should have ellipses next to each other (``curve_order``):
     they go through the same nodes at the same time then, twice as fast.
@@ -221,6 +234,8 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active):
     points, boxes = index.points, index.boxes
     half_extent = 0.5 * index.extent
     abs_a, abs_b, abs_c = dr.abs(a), dr.abs(b), dr.abs(c)
+    if dr.hint(whole is not None, mode="scalar"):
+        tolerance, rim, visit_node = dr.opaque(mi.Float, whole[0]), whole[1], whole[2]
 
     queue = dr.alloc_local(mi.UInt32, _QUEUE + 1)
     node = dr.select(active, mi.UInt32(1), mi.UInt32(0))  # 0: finished
@@ -231,10 +246,19 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active):
             half = size * half_extent
             # Relative to the centre first: far from the origin a box's middle is not a number.
             mid = (low - center) + half
-            da = dr.maximum(dr.abs(dr.dot(a, mid)) - dr.dot(abs_a, half), 0)
-            db = dr.maximum(dr.abs(dr.dot(b, mid)) - dr.dot(abs_b, half), 0)
-            dc = dr.abs(dr.dot(c, mid)) - dr.dot(abs_c, half)
-            hit = ~empty & (da * da + db * db <= cut2) & (dc <= 1)
+            da, db, dc = dr.abs(dr.dot(a, mid)), dr.abs(dr.dot(b, mid)), dr.abs(dr.dot(c, mid))
+            wa, wb, wc = dr.dot(abs_a, half), dr.dot(abs_b, half), dr.dot(abs_c, half)
+            near_a, near_b = dr.maximum(da - wa, 0), dr.maximum(db - wb, 0)
+            hit = ~empty & (near_a * near_a + near_b * near_b <= cut2) & (dc - wc <= 1)
+            if dr.hint(whole is not None, mode="scalar"):
+                far_a, far_b = da + wa, db + wb
+                on_rim = far_a * far_a + far_b * far_b > cut2
+                error = wa * wa + wb * wb + dr.select(on_rim, rim, 0)
+                small = hit & (error <= tolerance) & (dc + wc <= 1)
+                taken = mi.Bool(False)
+                if small:
+                    total, taken = visit_node(total, node)
+                hit &= ~taken
             is_leaf = node >= n_leaves
             # Not a masked write: those go astray in Dr.Jit 1.5's LLVM backend.
             queue[dr.select(hit & is_leaf, found, _QUEUE)] = node - n_leaves

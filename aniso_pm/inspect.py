@@ -88,6 +88,14 @@ def examine(scene: Prepared) -> list[Finding]:
             [f"max_depth={settings.max_depth}"],
         ),
         Finding(
+            "sums over nodes",
+            settings.gather_tolerance > 0 and scene.needs_map,
+            "groups of photons inside a kernel count as one"
+            if settings.gather_tolerance
+            else "not built: every photon is summed",
+            [f"gather_tolerance={settings.gather_tolerance:g}"],
+        ),
+        Finding(
             "edge compensation",
             settings.edge_compensation and scene.needs_map,
             "short rays measure how much of each kernel lies on the surface",

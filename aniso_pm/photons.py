@@ -78,6 +78,7 @@ class PhotonMap:
     flux       W, interleaved channels, padded to a power of two.
     direction  where the light came from, 32 bits octahedral; None where no receiver needs it.
     wavelengths  nm, in spectral variants; the flux is W/nm then.
+    sums       summed.Sums of the index's nodes, or None.
     """
 
     emitted: int
@@ -87,6 +88,7 @@ class PhotonMap:
     flux: Any
     direction: Any
     wavelengths: Any
+    sums: Any = None
 
 
 EMPTY = PhotonMap(0, 0, 0, None, None, None, None)
@@ -145,7 +147,12 @@ def build_map(
 
 def photon_flux(photons: PhotonMap, slot, active):
     """Flux (mi.Spectrum, W) of the photon in a slot."""
-    packed = dr.gather(_packet(), photons.flux, slot, active)
+    return read_flux(photons.flux, slot, active)
+
+
+def read_flux(column, slot, active):
+    """An entry of a column of fluxes that ``pack_flux`` has made."""
+    packed = dr.gather(_packet(), column, slot, active)
     return mi.Spectrum(*(packed[k] for k in range(dr.size_v(mi.Spectrum))))
 
 
@@ -173,11 +180,16 @@ def encode_normal(n):
     return _encode(n, 12)
 
 
-def faces(word, n):
-    """Is the photon's normal within 41 degrees of n (cosine above NORMAL_COS)?"""
+def decode_normal(word):
+    """Inverse of ``encode_normal``; higher bits of the word are ignored."""
+    return _decode(word, 12)
+
+
+def faces(word, n, least=NORMAL_COS):
+    """Is the cosine between the photon's normal and n above ``least`` (> 0)?"""
     v = _octahedral(word, 12)
     cosine = dr.dot(v, n)
-    return (cosine > 0) & (dr.square(cosine) > NORMAL_COS**2 * dr.squared_norm(v))
+    return (cosine > 0) & (dr.square(cosine) > least**2 * dr.squared_norm(v))
 
 
 def _encode(v, bits):
@@ -260,7 +272,7 @@ def light_paths(scene, source, sampler, options, photons, stored, rejected, room
         active = active & (slot < room)
         dr.scatter(photons.position, position, slot, active)
         dr.scatter(photons.word, word, slot, active)
-        dr.scatter(photons.flux, _pack(flux), slot, active)
+        dr.scatter(photons.flux, pack_flux(flux), slot, active)
         if options.general:
             dr.scatter(photons.direction, _encode(direction, 16), slot, active)
 
@@ -401,6 +413,7 @@ def _bent_bounce(ctx, bsdf, si, bs, weight, sampler, active):
     return bs, dr.select(delta, 2 * weight * cosines, value)
 
 
-def _pack(spectrum):
+def pack_flux(spectrum):
+    """A flux as it is stored, padded."""
     channels = [spectrum[k] for k in range(dr.size_v(mi.Spectrum))]
     return _packet()(*(channels + [mi.Float(0)] * (_flux_width() - len(channels))))

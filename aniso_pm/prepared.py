@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import density, emission, eye, photons
+from . import density, emission, eye, photons, summed
 from .needs import Needs, read_scene
 from .settings import Settings
 
@@ -122,8 +122,10 @@ class Prepared:
     @property
     def bytes_per_photon(self) -> int:
         """Of a map at rest, index included: position and word, flux, direction, and one box of 16
-        bytes for every leaf and every inner node (at most 2 nodes for 4 photons)."""
-        return 16 + photons.flux_bytes() + (4 if self.needs.general else 0) + 8
+        bytes for every leaf and every inner node (at most 2 nodes for 4 photons), which have their
+        sums, too, where ``gather_tolerance`` asks for them."""
+        node = 16 + (20 + photons.flux_bytes() if self.settings.gather_tolerance else 0)
+        return 16 + photons.flux_bytes() + (4 if self.needs.general else 0) + node // 2
 
     @property
     def gather_depth(self) -> int:
@@ -161,7 +163,7 @@ class Prepared:
             wavelengths,
         )
         seed = stream_seed(seed, PHOTONS, index)
-        return photons.build_map(
+        map_ = photons.build_map(
             self.scene,
             self.emission,
             s.photon_count,
@@ -172,6 +174,10 @@ class Prepared:
             lap,
             self.light_wavefront,
         )
+        if s.gather_tolerance > 0 and map_.stored:
+            map_ = replace(map_, sums=summed.build(map_))
+            lap("index")
+        return map_
 
     def trace(self, sampler, ray, expected: int = 0):
         """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``."""
@@ -219,7 +225,14 @@ class Prepared:
         )
         kernel, follows, degenerate = density.kernels(points, radius, options)
         L, count = density.estimate(
-            map_, points, kernel, radius, self.gather_depth, mi.Bool(True), surface
+            map_,
+            points,
+            kernel,
+            radius,
+            self.gather_depth,
+            mi.Bool(True),
+            surface,
+            s.gather_tolerance,
         )
         lost = mi.Bool(False)
         if s.edge_compensation:
