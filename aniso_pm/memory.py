@@ -32,6 +32,7 @@ _SHARE = 0.75
 _FIXED = 32 << 20  # compiled kernels
 _LIGHT_PATH = 24  # in flight: random numbers, emitter sample
 _PHOTON = 140  # while the index is built: buffers, sorted copies, keys (16 of them flux)
+_PHOTON_SUMMED = 22  # with gather_tolerance: its share of the sums over nodes
 _EYE_SAMPLE = 70  # in flight: ray, random numbers, radiance
 _POINT = 100  # gather point: columns, sorted copies, result (12 of them throughput)
 _POINT_LOBE = 80  # its lobe
@@ -72,7 +73,8 @@ class Plan:
         """Bytes at the peak beyond what the process holds before, by what they are for."""
         scene, job = self.scene, self.job
         flux, general = photons.flux_bytes(), bool(scene.needs.general)
-        per_photon = _PHOTON + 2 * (flux - 16) + general * 8
+        summed = scene.settings.gather_tolerance > 0
+        per_photon = _PHOTON + 2 * (flux - 16) + general * 8 + summed * _PHOTON_SUMMED
         per_point = _POINT + scene.follow_lobes * _POINT_LOBE + general * _POINT_GENERAL
         per_sample = _EYE_SAMPLE + _points_per_sample(scene) * (per_point + 2 * (flux - 16))
         paths = min(self.light_paths, scene.settings.photon_count) if scene.needs_map else 0
@@ -96,6 +98,8 @@ class Plan:
 
 def _points_per_sample(scene: Prepared) -> float:
     """Gather points that an eye path leaves in typical scenes."""
+    if not scene.needs_map:
+        return 0
     if scene.use == "caustic":
         return 4.5
     return 2 if scene.use == "final_gather" else 1 + 0.2 * bool(scene.needs.general)

@@ -103,6 +103,8 @@ class Prepared:
     def crowding(self) -> int:
         """Share of a wavefront's eye paths that may be traced at once: where paths leave gather
         points at several vertices, fewer of them fit into the same memory."""
+        if not self.needs_map:
+            return 1
         if self.use == "caustic":
             return 8
         return 2 if self.use == "final_gather" or self.needs.general else 1
@@ -188,7 +190,8 @@ class Prepared:
             s.rr_depth,
             self.min_segments,
             self.hide_emitters,
-            self.follow_lobes,
+            self.needs_map,
+            self.follow_lobes and self.needs_map,
             self.deep,
             bool(self.needs.general),
             s.gather_roughness,
