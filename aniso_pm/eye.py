@@ -127,9 +127,9 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     return L, valid, take(points, dr.arange(mi.UInt32, found)) if found else None
 
 
-def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room):
+def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room, see=None):
     """One wavefront of eye paths, gather points into their columns: (radiance, valid, rows used,
-    columns)."""
+    columns). see: called as see(lane, depth, si, bsdf, bs, active) where paths scatter."""
 
     def push(point, active):
         slot = dr.scatter_inc(rows, mi.UInt32(0), active)
@@ -141,7 +141,7 @@ def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room):
 
         map_tree(put, points, point)
 
-    L, valid = _walk(scene, sampler, ray, options, push)
+    L, valid = _walk(scene, sampler, ray, options, push, see)
     return L, valid, rows, points
 
 
@@ -172,7 +172,7 @@ def _blank(o: WalkOptions) -> GatherPoints:
 
 
 @dr.syntax
-def _walk(scene, sampler, ray, options, push):
+def _walk(scene, sampler, ray, options, push, see):
     ctx = mi.BSDFContext()
     o = options
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
@@ -239,6 +239,8 @@ def _walk(scene, sampler, ray, options, push):
         # --- Sample the BSDF ---
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        if dr.hint(see is not None, mode="scalar"):
+            see(lane, depth, si, bsdf, bs, active)
         # Share of the gathered part in the sampled direction
         g = dr.select(is_receiver, mi.Spectrum(1), mi.Spectrum(0))
         if dr.hint(o.general, mode="scalar"):

@@ -68,7 +68,7 @@ def read_scene(scene, gather_roughness: float) -> Needs:
         if bsdf is None or bsdf.ptr in seen:
             continue
         seen.add(bsdf.ptr)
-        evidence = f"{name}: {_describe(bsdf)}"
+        evidence = f"{name}: {describe(bsdf)}"
         if may_gather(bsdf, gather_roughness):
             needs.receivers.append(evidence)
         if is_lambertian(bsdf):
@@ -110,12 +110,12 @@ def emitter_name(emitter) -> str:
     return f"{emitter.id()}: {emitter.class_name()}".removeprefix(": ")
 
 
-def _describe(bsdf) -> str:
+def describe(bsdf) -> str:
     """Class names of a tree of BSDFs: TwoSidedBRDF(RoughConductor)."""
     python = type(bsdf).__module__.split(".")[0] != "mitsuba"
     name = type(bsdf).__name__ if python else bsdf.class_name()
     distinct = {child.ptr: child for child in nested_bsdfs(children(bsdf))}  # twosided: twice one
-    nested = ", ".join(_describe(child) for child in distinct.values())
+    nested = ", ".join(describe(child) for child in distinct.values())
     return f"{name}({nested})" if nested else name
 
 

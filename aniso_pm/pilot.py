@@ -38,6 +38,18 @@ def camera_rays(sensor, seed: int):
     return ray
 
 
+def settle(scene: Prepared, sensor, seed: int, samples: int, count=None, radius=None):
+    """(light paths per pass, bandwidth of the first pass): what is not given is chosen.
+
+    samples: eye samples of a pass.
+    """
+    if not count or not radius:
+        rays = camera_rays(sensor, seed)
+        count = count or automatic_photon_count(scene, rays, seed, samples)
+        radius = radius or automatic_radius(scene.with_(photon_count=count), rays, seed)
+    return count, radius
+
+
 def _weighted_median(radii) -> float:
     """Median with weights 1/r² (proportional to the density of photons, hence to the light that
     the point receives): half of the light is estimated at smaller radii, half at larger ones."""

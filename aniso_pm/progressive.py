@@ -23,7 +23,7 @@ from . import digest, state
 from . import film as films
 from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .errors import is_interrupt
-from .pilot import automatic_photon_count, automatic_radius, camera_rays
+from .pilot import settle
 from .prepared import EYE, PROBE, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
 from .stopping import Stopping
@@ -162,12 +162,10 @@ class _Run:
         known = earlier.identity if earlier else {}
         count = settings.photon_count or known.get("photon count")
         self.radius0 = settings.initial_radius or known.get("initial radius")
-        if not count or not self.radius0:
-            rays = camera_rays(self.sensor, self.seed)
-            samples = self.shares.each * films.pixel_count(self.film)
-            count = count or automatic_photon_count(self.scene, rays, self.seed, samples)
-            self.scene = self.scene.with_(photon_count=count)
-            self.radius0 = self.radius0 or automatic_radius(self.scene, rays, self.seed)
+        samples = self.shares.each * films.pixel_count(self.film)
+        count, self.radius0 = settle(
+            self.scene, self.sensor, self.seed, samples, count, self.radius0
+        )
         self.scene = self.scene.with_(photon_count=count)
         self.clock.lap("pilot")
         # The response curves of a specfilm do not survive a replay of the scene that they are in.

@@ -16,7 +16,7 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import InputError, is_interrupt, one_line
 
-from . import examine, render
+from . import examine, explain, render
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -78,6 +78,7 @@ for command in (
     render.render,
     render.merge,
     examine.inspect,
+    explain.explain,
     examine.stability,
     examine.doctor,
 ):
