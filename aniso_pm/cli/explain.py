@@ -63,7 +63,8 @@ def explain(
         print(f"aniso-pm: '{out}' is not written, there is no kernel to draw", file=sys.stderr)
     elif out is not None:
         with output.replacing(out) as partial:
-            found.plot().savefig(partial, format=out.suffix.lower()[1:], dpi=144)
+            kind = out.suffix.lower()[1:]
+            found.plot().savefig(partial, format=kind, dpi=144, bbox_inches="tight")
     if as_json:
         print(json.dumps(output.plain(found.data()), indent=2, ensure_ascii=False))
     else:

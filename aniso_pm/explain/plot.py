@@ -37,7 +37,7 @@ def figure(found: Explanation):
 
 def as_svg(found: Explanation) -> str:
     text = io.StringIO()
-    figure(found).savefig(text, format="svg")
+    figure(found).savefig(text, format="svg", bbox_inches="tight")
     return text.getvalue()[text.getvalue().index("<svg") :]
 
 

@@ -157,7 +157,7 @@ class Explanation:
     def _repr_html_(self) -> str:
         import html
 
-        words = f"<pre>{html.escape(str(self))}</pre>"
+        words = f'<pre style="font-family: monospace">{html.escape(str(self))}</pre>'
         if self.kernel is None:
             return words
         from .plot import as_svg
