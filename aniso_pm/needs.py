@@ -23,6 +23,7 @@ class Needs:
     bent       surfaces with bump or normal maps.
     unreadable glossy surfaces whose roughness cannot be read: kernels behind them are discs.
     unseen     emitters whose direct light only photons can find.
+    grainless  meshes without texture coordinates that have an anisotropic BSDF.
     """
 
     lobes: list[str] = field(default_factory=list)
@@ -32,6 +33,7 @@ class Needs:
     bent: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
+    grainless: list[str] = field(default_factory=list)
 
 
 def read_scene(scene, gather_roughness: float) -> Needs:
@@ -65,7 +67,12 @@ def read_scene(scene, gather_roughness: float) -> Needs:
             _refuse_unlit(needs, f"{name}: Instance")
             continue
         bsdf = shape.bsdf()
-        if bsdf is None or bsdf.ptr in seen:
+        if bsdf is None:
+            continue
+        if isinstance(shape, mi.Mesh) and not shape.has_vertex_texcoords():
+            if _may_be_anisotropic(bsdf):
+                needs.grainless.append(f"{name}: {describe(bsdf)}")
+        if bsdf.ptr in seen:
             continue
         seen.add(bsdf.ptr)
         evidence = f"{name}: {describe(bsdf)}"
