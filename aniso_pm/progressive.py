@@ -378,6 +378,8 @@ class _Run:
             checkpoint.write(self._state())
             if checkpoint.on_write:
                 checkpoint.on_write()
+        if due or callback:
+            self.clock.lap("output")
 
     def _state(self) -> state.State:
         return state.State(

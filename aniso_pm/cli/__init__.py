@@ -16,7 +16,7 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import InputError, is_interrupt, one_line
 
-from . import examine, explain, render
+from . import examine, explain, reference, render, report, scenes
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -77,6 +77,9 @@ def _program(
 for command in (
     render.render,
     render.merge,
+    reference.reference,
+    report.report,
+    scenes.scenes,
     examine.inspect,
     explain.explain,
     examine.stability,
