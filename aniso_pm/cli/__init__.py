@@ -20,7 +20,7 @@ from . import examine, explain, reference, render, report, scenes
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
