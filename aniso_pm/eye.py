@@ -80,13 +80,14 @@ class GatherPoints:
     caustic: Any
 
 
-def map_tree(function, *trees):
+def map_tree(function, *trees: Any) -> Any:
     """Apply a function to the Dr.Jit arrays of equal trees of dataclasses (None stays None)."""
     first = trees[0]
     if first is None:
         return None
     if is_dataclass(first):
-        return type(first)(
+        kind: Any = type(first)
+        return kind(
             **{
                 f.name: map_tree(function, *(getattr(t, f.name) for t in trees))
                 for f in fields(first)

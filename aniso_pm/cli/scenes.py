@@ -38,7 +38,7 @@ def scenes(
     elif show:
         for scene in found:
             print(fill(f"{scene.name}: {scene.about}", 100, subsequent_indent="    "))
-    else:
+    elif target:
         first = target / "brushed_wall.xml"
         print(
             f"{len(found)} scenes in {target}; try\n"

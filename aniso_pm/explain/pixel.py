@@ -84,7 +84,7 @@ def explain(
     _, _, points = prepared.trace(sampler, ray, see=vertices.see)
 
     found = Explanation(
-        pixel=tuple(pixel),
+        pixel=(int(pixel[0]), int(pixel[1])),
         pass_index=pass_index,
         seed=seed,
         radius=radius if map_.stored else None,
@@ -126,7 +126,7 @@ def explain(
         pixel_radiance=tuple(map(float, radiance.sum(0) / samples)),
     )
     chosen = _choose(lanes, follows, radiance.mean(1), sample)
-    if chosen is None:
+    if chosen is None and sample is not None:
         path = vertices.path(sample, scene, ())
         return replace(found, sentence=f"eye path {sample} reads no photon map", path=path)
     point = eye.take(points, mi.UInt32(chosen))
@@ -280,7 +280,7 @@ def _kernel(prepared: Prepared, point, radius: float, lost: bool):
     outlines = {"kernel": outline(plane.s, plane.t)}
     disc = density.disc(point.n, mi.Float(radius))
     outlines["disc"] = outline(disc.s, disc.t)
-    if follows:
+    if follows and lobe is not None:
         free = replace(options, guard=False)
         bare, _, _ = density.kernels(point, mi.Float(radius), free)
         outlines["unguarded"] = outline(bare.s, bare.t)
@@ -299,11 +299,16 @@ def _lobe(path) -> Lobe:
         z=tuple(z),
         lam=lam,
         mu=mu,
-        sigma=tuple(float(np.degrees((2 * b) ** -0.5)) for b in (lam, mu)),
+        sigma=(_sigma(lam), _sigma(mu)),
         r=tuple(r),
         off=float(np.sqrt(2 * lam * (r @ x) ** 2 + 2 * mu * (r @ y) ** 2)),
         distance=float(path.distance[0]),
     )
+
+
+def _sigma(bandwidth: float) -> float:
+    """Standard deviation, degrees, of exp(−bandwidth · angle²)."""
+    return float(np.degrees((2 * bandwidth) ** -0.5))
 
 
 def _ellipse(s, t):

@@ -24,11 +24,11 @@ def figure(found: Explanation):
 
     if found.kernel is None:
         raise ValueError(f"pixel {found.pixel[0]},{found.pixel[1]}: {found.sentence}")
-    shown = found.lobe is not None and found.kernel.follows_lobe
-    drawing = Figure(figsize=(11 if shown else 6.5, 6.6), layout="constrained")
-    panels = drawing.subplots(1, 2 if shown else 1, squeeze=False)[0]
-    if shown:
-        _draw_lobe(panels[0], found.lobe, found.outlines["seen from p0"])
+    lobe = found.lobe if found.kernel.follows_lobe else None
+    drawing = Figure(figsize=(11 if lobe else 6.5, 6.6), layout="constrained")
+    panels = drawing.subplots(1, 2 if lobe else 1, squeeze=False)[0]
+    if lobe:
+        _draw_lobe(panels[0], lobe, found.outlines["seen from p0"])
     _draw_plane(panels[-1], found)
     title = f"pixel {found.pixel[0]},{found.pixel[1]}, eye path {found.sample}\n{found.sentence}"
     drawing.suptitle(title, fontsize="medium")
@@ -65,7 +65,8 @@ def _draw_lobe(axes, lobe: Lobe, kernel):
 
 def _draw_plane(axes, found: Explanation):
     """Photons and kernel in the receiver's tangent plane."""
-    photons, lines = found.photons, found.outlines
+    photons, kernel, lines = found.photons, found.kernel, found.outlines
+    assert photons is not None and kernel is not None
     elsewhere = ~photons.facing
     axes.plot(*photons.xy[elsewhere].T, "x", ms=3, color="0.85", label="photons on other surfaces")
     outside = photons.facing & ~photons.counted
@@ -85,14 +86,14 @@ def _draw_plane(axes, found: Explanation):
         label=f"{total} photons inside{drawn}",
     )
     axes.figure.colorbar(dots, ax=axes, label="kernel weight", shrink=0.7)
-    kernel = lines["kernel"]
-    axes.plot(*kernel.T, color=_KERNEL, lw=2, label="kernel, 1/e")
-    axes.plot(*(_CUT * kernel).T, color=_KERNEL, lw=1, label="kernel, cut")
-    if found.kernel.follows_lobe:
+    outline = lines["kernel"]
+    axes.plot(*outline.T, color=_KERNEL, lw=2, label="kernel, 1/e")
+    axes.plot(*(_CUT * outline).T, color=_KERNEL, lw=1, label="kernel, cut")
+    if kernel.follows_lobe:
         axes.plot(*lines["disc"].T, color="k", lw=1, ls="--", label="disc of that bandwidth, 1/e")
         axes.plot(*lines["unguarded"].T, color=_KERNEL, lw=1, ls=":", label="without guard, 1/e")
         axes.plot(*lines["footprint"].T, color=_LOBE, lw=1, ls="-.", label="lobe's footprint, 1/e")
-    reach = 1.15 * np.abs(_CUT * kernel).max()
+    reach = 1.15 * np.abs(_CUT * outline).max()
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     axes.set(title="The receiver's plane at p1", xlabel="along s", ylabel="along t")
     _legend(axes)
