@@ -29,8 +29,9 @@ from . import index as spatial
 from .eye import GatherPoints
 from .kernel import PlaneKernel, disc, guarded_axes
 from .photons import (
+    NORMAL_COS,
     PhotonMap,
-    decode_normal,
+    faces,
     is_caustic,
     photon_direction,
     photon_flux,
@@ -40,9 +41,8 @@ from .receivers import gathered_part
 
 CUT2 = 4.0
 KERNEL_MASS = 1 - math.exp(-CUT2)
-# A photon on the same surface: offset along the normal in bandwidths, cosine between normals.
+# A photon on the same surface: offset along the normal in bandwidths.
 SLAB = 0.5
-NORMAL_COS = 0.75
 # Rays after which the probe gives up: 1/m is taken to be at most this.
 PROBES_MAX = 12
 
@@ -156,7 +156,7 @@ def _filter(points: GatherPoints, max_depth):
     allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
 
     def counts(word):
-        yes = dr.dot(decode_normal(word), n) > NORMAL_COS
+        yes = faces(word, n)
         if max_depth:
             yes &= segments(word) <= allowed
         if points.caustic is not None:

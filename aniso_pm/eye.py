@@ -22,6 +22,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .index import curve_order
 from .lobe_path import LobeOnPath, follow, no_lobe
 from .rays import largest_coordinate, spawn_ray
 from .receivers import gathered_part, read_receiver
@@ -56,7 +57,7 @@ class WalkOptions:
 
 @dataclass
 class GatherPoints:
-    """Places where eye paths read the photon map, in no particular order.
+    """Places where eye paths read the photon map, along a curve that keeps neighbours together.
 
     lane       index of the eye path.
     p, n       position; geometric normal of the side that is seen.
@@ -125,7 +126,11 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
         if found <= capacity:
             break
         capacity = found + found // 16
-    return L, valid, take(points, dr.arange(mi.UInt32, found)) if found else None
+    if not found:
+        return L, valid, None
+    # Neighbours will look up the same photons.
+    position = dr.gather(mi.Point3f, points.p, dr.arange(mi.UInt32, found))
+    return L, valid, take(points, curve_order(position))
 
 
 def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room, see=None):

@@ -1,11 +1,12 @@
 """Points → implicit bounding-volume hierarchy; sums over elliptical neighbourhoods.
 
-Points are sorted along a Morton curve of 21 bits an axis (a coin in a stadium: 2e6 cells along
+Points are sorted along a Hilbert curve of 21 bits an axis (a coin in a stadium: 2e6 cells along
 the longest side) and cut into leaves of LEAF points. The leaves are the bottom row of a complete
 binary tree in heap order: node i has the children 2i and 2i + 1, leaf j is node n_leaves + j, no
-pointer is stored. Boxes are made by pairwise minima and maxima, level by level. The traversal needs
-no stack: a node that is hit goes to 2i; otherwise to the next node in depth-first order, which is
-i + 1 with its trailing zeros shifted out (1 means: finished).
+pointer is stored. Boxes are made by pairwise minima and maxima, level by level, and stored in 16
+bytes, one load, a few per cent too large. The traversal needs no stack: a node that is hit goes to
+2i; otherwise to the next node in depth-first order, which is i + 1 with its trailing zeros shifted
+out (1 means: finished).
 
 A neighbourhood is an elliptical cylinder {d : (a·d)² + (b·d)² <= cut², |c·d| <= 1} around a
 centre. Its test against a box costs the same at any aspect ratio, so a thin ellipse visits the
@@ -23,7 +24,14 @@ import drjit as dr
 import mitsuba as mi
 
 LEAF = 8
-_MORTON_BITS = 21
+_BITS = 21
+# Leaves that a lane finds before it goes through their points. One more entry is a waste bin; with
+# 32 entries and more Dr.Jit 1.5 is reported to break its stack.
+_QUEUE = 15
+# A box is its lower corner and its size as three numbers of 10 bits, relative to the whole cube:
+# 5 of exponent, 5 of mantissa, rounded up. This is the exponent of the smallest as a float has it.
+_EXPONENT = 96 << 23
+_EMPTY = 1 << 30  # in the word of the sizes: nothing in the box
 
 
 @dataclass(frozen=True)
@@ -50,39 +58,56 @@ class Ellipses:
 class Index:
     """Hierarchy over ``count`` points.
 
-    order   permutation that sorted the points (UInt32): slot → number given to ``build``.
-    points  x, y, z and the caller's 32-bit word of each slot, interleaved.
-    boxes   lower corner, 0, upper corner, 0 of each node, interleaved, in heap order.
+    points  x, y, z and the caller's 32-bit word of each slot, interleaved; not a number in the
+            slots that fill up the last leaf.
+    boxes   lower corner and size (see ``_pack``) of each node, interleaved, in heap order.
+    extent  the longest side of all points together, the unit of the sizes.
     """
 
     count: int
     n_leaves: int
-    order: Any
     points: Any
     boxes: Any
+    extent: Any
 
 
-def build(positions, word) -> Index:
-    """Build the hierarchy. positions: Point3f of finite points; word: UInt32 that is handed to
-    the visitor of ``gather`` with each point. At least one point."""
+def curve_order(positions):
+    """Permutation (UInt32) that sorts points along a Hilbert curve through them."""
+    low, extent = _cube(positions)
+    scale = dr.select(extent > 0, (2**_BITS - 1) / extent, 0)
+    return dr.argsort(_hilbert((positions - low) * scale))
+
+
+def _cube(positions):
+    """(lower corner, side) of a cube around points."""
+    low, high = (mi.Point3f(*(f(axis) for axis in positions)) for f in (dr.min, dr.max))
+    return low, dr.max(high - low)
+
+
+def build(positions, word) -> tuple[Index, Any]:
+    """(hierarchy, order) of at least one point; order: slot → number of the point (UInt32).
+
+    positions: Point3f of finite points; word: UInt32 that is handed to the visitor of ``gather``
+    with each point.
+    """
     count = dr.width(positions)
-    order = dr.argsort(_morton(positions))
+    order = curve_order(positions)
+    _, extent = _cube(positions)
     positions = dr.gather(mi.Point3f, positions, order)
-    word = dr.reinterpret_array(mi.Float, dr.gather(mi.UInt32, mi.UInt32(word), order))
-    points = dr.empty(mi.Float, 4 * count)
+    word = dr.reinterpret_array(mi.Float, dr.gather(mi.UInt32, word, order))
+    used_leaves = -(-count // LEAF)
+    points = dr.full(mi.Float, dr.nan, 4 * LEAF * used_leaves)
     dr.scatter(points, mi.Vector4f(positions.x, positions.y, positions.z, word), _iota(count))
 
     n_leaves = 1
-    while n_leaves * LEAF < count:
+    while n_leaves < used_leaves:
         n_leaves *= 2
-    boxes = dr.empty(mi.Float, 16 * n_leaves)
+    boxes = dr.zeros(mi.Float, 8 * n_leaves)
     low, high = _leaf_boxes(points, count, n_leaves)
     level = n_leaves
     while True:
         # Node 0 does not exist; every other node is written exactly once.
-        node = _iota(level) + level
-        dr.scatter(boxes, mi.Vector4f(low.x, low.y, low.z, 0), 2 * node)
-        dr.scatter(boxes, mi.Vector4f(high.x, high.y, high.z, 0), 2 * node + 1)
+        dr.scatter(boxes, _pack(low, high, extent), _iota(level) + level)
         dr.eval(boxes, low, high)
         if level == 1:
             break
@@ -92,8 +117,8 @@ def build(positions, word) -> Index:
             combine(dr.gather(mi.Point3f, v, left), dr.gather(mi.Point3f, v, left + 1))
             for v, combine in ((low, dr.minimum), (high, dr.maximum))
         )
-    dr.eval(points, order)
-    return Index(count, n_leaves, order, points, boxes)
+    dr.eval(points, order, extent)
+    return Index(count, n_leaves, points, boxes, extent), order
 
 
 def _iota(n):
@@ -101,6 +126,7 @@ def _iota(n):
 
 
 def _leaf_boxes(points, count, n_leaves):
+    """(lower, upper) corner of each leaf; +inf and −inf if it is empty."""
     low, high = dr.full(mi.Point3f, dr.inf, n_leaves), dr.full(mi.Point3f, -dr.inf, n_leaves)
     # As a literal, the count would be compiled into the kernel: a new one for every map.
     count = dr.opaque(mi.UInt32, count)
@@ -114,19 +140,52 @@ def _leaf_boxes(points, count, n_leaves):
     return low, high
 
 
-def _morton(p):
-    """63-bit Morton codes relative to the points' bounding cube."""
-    cells = 2**_MORTON_BITS - 1
-    low, high = (mi.Point3f(*(f(axis) for axis in p)) for f in (dr.min, dr.max))
-    extent = dr.max(high - low)
-    scale = dr.select(extent > 0, cells / extent, 0)
-    wide = dr.uint64_array_t(mi.Float)
-    code = wide(0)
+def _pack(low, high, extent):
+    """A box in four words."""
+    word, empty = mi.UInt32(0), low.x > high.x
     for axis in range(3):
-        # The product may round up past the last cell.
-        cell = dr.minimum(mi.UInt32((p[axis] - low[axis]) * scale), cells)
-        code |= _spread(wide(cell)) << axis
-    return code
+        # Rounding of the difference, the quotient and their product with the extent: 2⁻²² of it.
+        size = (high[axis] - low[axis]) / extent * (1 + 2**-20)
+        size = dr.select(empty | (extent == 0), 0, size)
+        bits = dr.reinterpret_array(mi.UInt32, dr.maximum(size, 2.0**-31))
+        word |= ((bits - _EXPONENT + 0x3FFFF) >> 18) << (10 * axis)
+    word = dr.select(empty, _EMPTY, word)
+    return mi.Vector4f(low.x, low.y, low.z, dr.reinterpret_array(mi.Float, word))
+
+
+def _unpack(box):
+    """(lower corner, size / extent, empty?) of what ``_pack`` made."""
+    word = dr.reinterpret_array(mi.UInt32, box.w)
+    size = (((word >> (10 * axis)) & 0x3FF) << 18 for axis in range(3))
+    size = mi.Vector3f(*(dr.reinterpret_array(mi.Float, bits + _EXPONENT) for bits in size))
+    return mi.Point3f(box.x, box.y, box.z), size, word >= _EMPTY
+
+
+@dr.syntax
+def _hilbert(cell):
+    """63-bit Hilbert codes of positions in cells [Skilling 2004]: untwist, then Gray code."""
+    x, y, z = mi.UInt32(cell.x), mi.UInt32(cell.y), mi.UInt32(cell.z)
+    bit = mi.UInt32(1 << (_BITS - 1))
+    while bit > 1:
+        below = bit - 1
+        x = dr.select(x & bit != 0, x ^ below, x)
+        swap = (x ^ y) & below
+        flip = y & bit != 0
+        x, y = dr.select(flip, x ^ below, x ^ swap), dr.select(flip, y, y ^ swap)
+        swap = (x ^ z) & below
+        flip = z & bit != 0
+        x, z = dr.select(flip, x ^ below, x ^ swap), dr.select(flip, z, z ^ swap)
+        bit >>= 1
+    y ^= x
+    z ^= y
+    gray = mi.UInt32(0)
+    bit = mi.UInt32(1 << (_BITS - 1))
+    while bit > 1:
+        gray = dr.select(z & bit != 0, gray ^ (bit - 1), gray)
+        bit >>= 1
+    wide = dr.uint64_array_t(mi.Float)
+    x, y, z = wide(x ^ gray), wide(y ^ gray), wide(z ^ gray)
+    return (_spread(x) << 2) | (_spread(y) << 1) | _spread(z)
 
 
 def _spread(x):
@@ -147,47 +206,52 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active):
     """Fold ``visit`` over all points inside each lane's ellipse.
 
     visit(total, slot, word, rho2, inside) -> total is called with the slot of a point, its word,
-    ρ² = (a·d)² + (b·d)² and whether it is inside; ``total`` is any tree of Dr.Jit arrays.
+    ρ² = (a·d)² + (b·d)² and whether it is inside (it is not in slots without a point); ``total`` is
+    any tree of Dr.Jit arrays.
 
-    Two nested loops: one looks for the next leaf that is hit, one goes through its points, so that
-    the lanes of a vector spend their time in the same loop.
+    Lanes that lie next to each other should have ellipses next to each other (``curve_order``):
+    they go through the same nodes at the same time then, twice as fast.
+
+    Two loops in turn: one looks for leaves that are hit until the queue is full, one goes through
+    their points. So the lanes of a vector spend their time in the same loop, and wait for each
+    other once for some fifteen leaves, not for each.
     """
     center, a, b, c = ellipses.center, ellipses.a, ellipses.b, ellipses.c
-    abs_a, abs_b, abs_c = dr.abs(a), dr.abs(b), dr.abs(c)
-    count, n_leaves = dr.opaque(mi.UInt32, index.count), dr.opaque(mi.UInt32, index.n_leaves)
+    n_leaves = dr.opaque(mi.UInt32, index.n_leaves)
     points, boxes = index.points, index.boxes
+    half_extent = 0.5 * index.extent
+    abs_a, abs_b, abs_c = dr.abs(a), dr.abs(b), dr.abs(c)
 
+    queue = dr.alloc_local(mi.UInt32, _QUEUE + 1)
     node = dr.select(active, mi.UInt32(1), mi.UInt32(0))  # 0: finished
     while node != 0:
-        leaf = mi.UInt32(0)
-        while (node != 0) & (leaf == 0):
-            low = dr.gather(mi.Vector4f, boxes, 2 * node)
-            high = dr.gather(mi.Vector4f, boxes, 2 * node + 1)
+        found = mi.UInt32(0)
+        while (node != 0) & (found < _QUEUE):
+            low, size, empty = _unpack(dr.gather(mi.Vector4f, boxes, node))
+            half = size * half_extent
             # Relative to the centre first: far from the origin a box's middle is not a number.
-            low = mi.Point3f(low.x, low.y, low.z) - center
-            high = mi.Point3f(high.x, high.y, high.z) - center
-            mid, half = 0.5 * (high + low), 0.5 * (high - low)
+            mid = (low - center) + half
             da = dr.maximum(dr.abs(dr.dot(a, mid)) - dr.dot(abs_a, half), 0)
             db = dr.maximum(dr.abs(dr.dot(b, mid)) - dr.dot(abs_b, half), 0)
             dc = dr.abs(dr.dot(c, mid)) - dr.dot(abs_c, half)
-            # Empty leaves have low = +inf, high = −inf: their half extent fails the last test.
-            hit = (da * da + db * db <= cut2) & (dc <= 1) & (half.x >= 0)
+            hit = ~empty & (da * da + db * db <= cut2) & (dc <= 1)
             is_leaf = node >= n_leaves
-            leaf = dr.select(hit & is_leaf, node, 0)
+            # Not a masked write: those go astray in Dr.Jit 1.5's LLVM backend.
+            queue[dr.select(hit & is_leaf, found, _QUEUE)] = node - n_leaves
+            found += dr.select(hit & is_leaf, mi.UInt32(1), 0)
             following = node + 1
             following = following >> dr.tzcnt(following)
             following = dr.select(following == 1, 0, following)
             node = dr.select(hit & ~is_leaf, 2 * node, following)
 
-        slot = (leaf - n_leaves) * LEAF
-        end = dr.select(leaf != 0, dr.minimum(slot + LEAF, count), 0)
-        slot = dr.select(leaf != 0, slot, 0)
-        while slot < end:
+        k = mi.UInt32(0)
+        while k < LEAF * found:
+            slot = LEAF * queue[k // LEAF] + k % LEAF
             point = dr.gather(mi.Vector4f, points, slot)
             d = mi.Vector3f(point.x, point.y, point.z) - center
             da, db = dr.dot(a, d), dr.dot(b, d)
             rho2 = da * da + db * db
             inside = (rho2 <= cut2) & (dr.abs(dr.dot(c, d)) <= 1)
             total = visit(total, slot, dr.reinterpret_array(mi.UInt32, point.w), rho2, inside)
-            slot += 1
+            k += 1
     return total

@@ -90,6 +90,8 @@ class PhotonMap:
 
 
 EMPTY = PhotonMap(0, 0, 0, None, None, None, None)
+# Cosine between normals from which two points may lie on the same surface.
+NORMAL_COS = 0.75
 # Segments that the word can tell apart: this number stands for itself and more.
 SEGMENTS_MAX = 127
 
@@ -119,12 +121,12 @@ def build_map(
         return PhotonMap(photon_count, 0, rejected, None, None, None, None)
     used = dr.arange(mi.UInt32, stored)
     position, word = (dr.gather(type(v), v, used) for v in (photons.position, photons.word))
-    index = spatial.build(position, word)
+    index, order = spatial.build(position, word)
     sorted_flux = dr.empty(mi.Float, stored * _flux_width())
-    dr.scatter(sorted_flux, dr.gather(_packet(), photons.flux, index.order), used)
+    dr.scatter(sorted_flux, dr.gather(_packet(), photons.flux, order), used)
     direction = None
     if options.general:
-        direction = dr.gather(mi.UInt32, photons.direction, index.order)
+        direction = dr.gather(mi.UInt32, photons.direction, order)
     dr.eval(sorted_flux, direction)
     lap("index")
     return PhotonMap(
@@ -162,9 +164,11 @@ def encode_normal(n):
     return _encode(n, 12)
 
 
-def decode_normal(word):
-    """Inverse of ``encode_normal``; higher bits of the word are ignored."""
-    return _decode(word, 12)
+def faces(word, n):
+    """Is the photon's normal within 41 degrees of n (cosine above NORMAL_COS)?"""
+    v = _octahedral(word, 12)
+    cosine = dr.dot(v, n)
+    return (cosine > 0) & (dr.square(cosine) > NORMAL_COS**2 * dr.squared_norm(v))
 
 
 def _encode(v, bits):
@@ -178,12 +182,17 @@ def _encode(v, bits):
 
 
 def _decode(word, bits):
+    return dr.normalize(_octahedral(word, bits))
+
+
+def _octahedral(word, bits):
+    """The decoded direction, not of unit length."""
     top = 2**bits - 1
     x = mi.Float(word & top) * (2 / top) - 1
     y = mi.Float((word >> bits) & top) * (2 / top) - 1
     z = 1 - dr.abs(x) - dr.abs(y)
     fold = dr.maximum(-z, 0)
-    return dr.normalize(mi.Vector3f(x - dr.mulsign(fold, x), y - dr.mulsign(fold, y), z))
+    return mi.Vector3f(x - dr.mulsign(fold, x), y - dr.mulsign(fold, y), z)
 
 
 def segments(word):

@@ -115,9 +115,9 @@ class Prepared:
 
     @property
     def bytes_per_photon(self) -> int:
-        """Of a map at rest, index included: position and word, flux, direction, and one box of 32
-        bytes for every leaf and every inner node (2 nodes for 4 to 8 photons: 12 bytes)."""
-        return 16 + photons.flux_bytes() + (4 if self.needs.general else 0) + 12
+        """Of a map at rest, index included: position and word, flux, direction, and one box of 16
+        bytes for every leaf and every inner node (at most 2 nodes for 4 photons)."""
+        return 16 + photons.flux_bytes() + (4 if self.needs.general else 0) + 8
 
     @property
     def gather_depth(self) -> int:

@@ -34,7 +34,7 @@ def ellipses(rng, centers, size, aspect):
 
 
 def gathered(points, words, e):
-    index = spatial.build(to_points(points), mi.UInt32(words.astype(np.uint32)))
+    index, _ = spatial.build(to_points(points), mi.UInt32(words.astype(np.uint32)))
 
     def visit(total, slot, word, rho2, inside):
         count, weight, tag = total
@@ -107,16 +107,51 @@ def test_coincident_points_are_all_found():
 
 def test_inactive_lanes_do_nothing():
     points = np.random.default_rng(0).random((100, 3))
-    index = spatial.build(to_points(points), dr.zeros(mi.UInt32, 100))
+    index, _ = spatial.build(to_points(points), dr.zeros(mi.UInt32, 100))
     e, _ = ellipses(np.random.default_rng(1), points[:8], 10.0, 1)
     active = mi.Bool([True, False] * 4)
-    count = spatial.gather(
-        index, e, CUT2, lambda total, *rest: total + 1, dr.zeros(mi.UInt32, 8), active
-    )
+
+    def visit(total, slot, word, rho2, inside):
+        return total + dr.select(inside, mi.UInt32(1), 0)
+
+    count = spatial.gather(index, e, CUT2, visit, dr.zeros(mi.UInt32, 8), active)
     assert list(count.numpy()) == [100, 0] * 4
 
 
 def test_order_is_a_permutation():
     points = np.random.default_rng(0).random((777, 3))
-    index = spatial.build(to_points(points), dr.zeros(mi.UInt32, 777))
-    np.testing.assert_array_equal(np.sort(index.order.numpy()), np.arange(777))
+    _, order = spatial.build(to_points(points), dr.zeros(mi.UInt32, 777))
+    np.testing.assert_array_equal(np.sort(order.numpy()), np.arange(777))
+
+
+def test_the_curve_never_jumps():
+    """A Hilbert curve through a full lattice goes from neighbour to neighbour."""
+    # Cells of a lattice of 16 fill the cube of 2²¹ cells exactly.
+    lattice = np.stack(np.meshgrid(*[np.arange(16)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    code = spatial._hilbert(to_points(lattice * 2**17 + 2**16)).numpy()
+    steps = np.diff(lattice[np.argsort(code)], axis=0)
+    np.testing.assert_array_equal(np.abs(steps).sum(1), 1)
+    assert len(np.unique(code)) == len(lattice)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
+def test_boxes_hold_their_points_tightly(scale):
+    """Also far from the origin, and at every level of the tree."""
+    rng = np.random.default_rng(3)
+    points = scale * (rng.random((3000, 3)) ** 4 * [1, 1, 1e-9] + [300, 0, -5])
+    points = points.astype(np.float32)
+    index, _ = spatial.build(to_points(points), dr.zeros(mi.UInt32, 3000))
+    low, size, empty = spatial._unpack(dr.unravel(mi.Vector4f, index.boxes))
+    low = np.array(low, dtype=np.float64).T
+    high = low + np.array(size, dtype=np.float64).T * float(index.extent[0])
+    leaf = np.arange(3000) // spatial.LEAF + index.n_leaves
+    p = index.points.numpy().reshape(-1, 4)[:3000, :3].astype(np.float64)
+    assert list(np.flatnonzero(~empty.numpy())[-1:]) == [leaf[-1]]
+    while leaf[-1] > 0:
+        assert np.all(low[leaf] <= p) and np.all(p <= high[leaf])
+        assert not empty.numpy()[leaf].any()
+        # 1/32 for the mantissa, and no size below 2⁻³¹ of the whole
+        tops = np.maximum.reduceat(p, np.flatnonzero(np.diff(leaf, prepend=0)))
+        slack = high[np.unique(leaf)] - tops
+        assert np.all(slack <= (tops - low[np.unique(leaf)]) / 31 + scale * 1e-8)
+        leaf = leaf // 2

@@ -191,7 +191,7 @@ def test_statistics_count_what_happened(scene):
     assert 0 < s["gather_points_anisotropic"] < s["gather_points"] <= s["eye_samples"]
     assert s["photons_stored"] > s["photons_emitted"] == 20_000
     assert s["photons_rejected"] == s["eye_samples_rejected"] == 0
-    assert set(s["seconds"]) == {"pilot", "photons", "eye", "gather", "film"}
+    assert set(s["seconds"]) == {"pilot", "photons", "index", "eye", "gather", "film"}
 
 
 def test_progress_is_reported_after_every_pass(scene):

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import density, eye, film
+from .. import density, eye, film, photons
 from ..kernel import kernel_axes, project_to_plane
 from ..ndf import read_roughness
 from ..needs import describe
@@ -337,8 +337,8 @@ def _photons(prepared: Prepared, map_, point, radius: float, outlines) -> Photon
     long, short = np.linalg.norm(s), np.linalg.norm(t)
     xy = np.stack([d @ s / long, d @ t / short], axis=1)
     word = dr.reinterpret_array(mi.UInt32, at.w)
-    cosine = dr.dot(density.decode_normal(word), mi.Vector3f(point.n)).numpy()
-    facing = (np.abs(d @ n) <= density.SLAB * radius) & (cosine > density.NORMAL_COS)
+    facing = photons.faces(word, mi.Vector3f(point.n)).numpy()
+    facing &= np.abs(d @ n) <= density.SLAB * radius
 
     reach = 1.15 * density.CUT2**0.5 * long
     near = np.flatnonzero((np.abs(xy) <= reach).all(1) & (np.abs(d @ n) <= reach))

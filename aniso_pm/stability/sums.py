@@ -21,8 +21,8 @@ def photon_map(position, power, emitted=1000) -> photons.PhotonMap:
     """A map of photons at ``position`` (n, 3) of ``power`` (n) on surfaces that face +z."""
     count = len(position)
     word = photons.encode_normal(mi.Normal3f(0, 0, 1)) | (2 << 24)
-    index = spatial.build(_points(position), dr.full(mi.UInt32, int(word[0]), count))
-    wide = np.array(power, np.float32)[index.order.numpy()]
+    index, order = spatial.build(_points(position), dr.full(mi.UInt32, int(word[0]), count))
+    wide = np.array(power, np.float32)[order.numpy()]
     width = 1 if dr.size_v(mi.Spectrum) == 1 else 4
     return photons.PhotonMap(emitted, count, 0, index, mi.Float(np.repeat(wide, width)), None, None)
 
@@ -152,7 +152,7 @@ def _thirty_million() -> Measured:
 
 def _visits(position, at, radius) -> float:
     """Photons tested per photon found, by discs in the plane z = 0."""
-    index = spatial.build(_points(position), dr.zeros(mi.UInt32, len(position)))
+    index, _ = spatial.build(_points(position), dr.zeros(mi.UInt32, len(position)))
     radius = dr.opaque(mi.Float, radius)
     disc = kernel.disc(mi.Normal3f(0, 0, 1), radius)
     ellipses = spatial.Ellipses.from_axes(
