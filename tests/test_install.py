@@ -180,7 +180,7 @@ def test_the_wheel_works_without_the_sources(built, tmp_path):
 
 
 def test_python_started_in_a_clone_finds_the_plugins_beside_the_package(tmp_path):
-    """As after `pip install .` in a clone: what is installed is hidden by the folder's own files."""
+    """As after `pip install .` in a clone, whose folder hides what is installed."""
     code = (
         "import sys\n"
         "sys.meta_path = [f for f in sys.meta_path if 'editable' not in repr(f).lower()]\n"
