@@ -99,6 +99,7 @@ def reference(
                 if made is None:
                     raise InterruptError from error
                 interrupted = True
+        assert made is not None  # grow() has yielded, or raised
         made.record.update(scene=scene.name, defines=defines)
         references.write(path, made, compact)
     record = made.record | {"output": str(path), "own_error": made.own_error}

@@ -18,9 +18,10 @@ from .pictures import HEAT
 # What each figure shows, by the first part of its name.
 CAPTIONS = {
     "error": "Relative MSE of the picture at hand after so many seconds (compilation not counted). "
-    "Lower is better; a curve begins with its first finished picture. Bands: 95 % intervals.",
+    "Lower is better; a curve begins with its first finished picture. Bands: 95 % intervals. Grey, "
+    "at the bottom: limited by the reference. Curves three decades above the best are cut off.",
     "split": "What the error at the largest budget consists of: noise, which more samples remove, "
-    "and bias², which they do not. Bars: 95 % intervals.",
+    "and bias², which they do not. Bars: 95 % intervals. Grey line: the reference's own error.",
     "ratio": "Error over that of the isotropic kernel after the same time, at the same kind of "
     "bandwidth, with the same photons and eye paths: below 1 the anisotropic kernel wins.",
     "bandwidth": "Relative MSE after short runs at each bandwidth, on seeds that are not "

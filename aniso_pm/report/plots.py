@@ -13,6 +13,8 @@ import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from . import metrics
+
 # Okabe and Ito's colours, which everybody can tell apart.
 COLOURS = {
     "isotropic": "#0072B2",
@@ -24,7 +26,9 @@ COLOURS = {
 }
 _MORE = ("#E69F00", "#56B4E9", "#a0522d", "#6a3d9a")
 _MARKS = {"isotropic": "o", "lobe": "s", "taylor": "^", "paper": "v", "path": "D", "ptracer": "x"}
-_SIZE = (5.2, 3.9)
+_SIZE = (5.2, 4.5)
+# Decades above the smallest error beyond which a curve leaves the picture.
+_DECADES = 3
 
 
 def figures(results: dict[str, Any], scene: dict[str, Any]) -> dict[str, Figure]:
@@ -53,15 +57,12 @@ def _errors(scene, rows, region) -> Figure:
         mine = [row for row in rows if row["method"] == method["name"]]
         _curve(ax, method, _colour(scene, method), mine)
     _budgets(ax, [row for row in rows if row["relative_mse"]["value"]])
-    ax.axhline(scene["reference"]["relative_mse"][region], color="0.6", lw=1)
-    ax.annotate(
-        "reference's own error",
-        (0.01, scene["reference"]["relative_mse"][region]),
-        xycoords=("axes fraction", "data"),
-        va="bottom",
-        fontsize=7,
-        color="0.4",
-    )
+    values = [v for row in rows if (v := row["relative_mse"]["value"]) and v > 0]
+    if values:
+        ax.set_ylim(min(values) / 3, 2 * min(max(values), min(values) * 10**_DECADES))
+        # Ten times the reference's own error: what lies below is limited by it.
+        limit = metrics.CLEAR * scene["reference"]["relative_mse"][region]
+        ax.axhspan(ax.get_ylim()[0] / 10, limit, color="0.93", lw=0, zorder=0)
     _legend(figure)
     return figure
 

@@ -85,8 +85,8 @@ def path_limits(integrator) -> dict[str, Any]:
         found = integrator.parameters()
         return {name: found[name] for name in ("max_depth", "hide_emitters")}
     # Mitsuba's own tell the depth by their text only.
-    depth = re.search(r"\bmax_depth = (-?\d+)", str(integrator))
-    depth = int(depth[1]) if depth else -1
+    said = re.search(r"\bmax_depth = (-?\d+)", str(integrator))
+    depth = int(said[1]) if said else -1
     hidden = bool(getattr(integrator, "hide_emitters", False))
     return {"max_depth": -1 if depth == _UNLIMITED else depth, "hide_emitters": hidden}
 
@@ -102,7 +102,7 @@ def make(
     spp: int | None = None,
     seed: int = 0,
     start: Reference | None = None,
-    progress: Callable[[float, int | None, str], None] | None = None,
+    progress: Callable[[float, float | None, str], None] | None = None,
 ) -> Reference:
     """A reference of what ``sensor`` sees of ``world``; arguments and errors as of :func:`grow`.
 
@@ -113,14 +113,18 @@ def make(
     for made in grow(world, sensor, integrator, seconds, spp, seed, start):
         if progress:
             progress(*state_of(made, seconds, spp, start))
+    assert made is not None  # without a start there is one pair of waves at least
     return made
 
 
-def state_of(made, seconds, spp, start) -> tuple[float, float, str]:
+def state_of(
+    made: Reference, seconds: float | None, spp: int | None, start: Reference | None
+) -> tuple[float, float, str]:
     """(done, total, text) for a progress bar."""
-    before = start.record["seconds"] if start else 0.0
-    done = (made.record["seconds"] - before, seconds) if seconds else (made.record["spp"], spp)
-    return *done, f"{made.record['spp']} spp, own error {made.own_error:.2%}"
+    text = f"{made.record['spp']} spp, own error {made.own_error:.2%}"
+    if seconds is None:
+        return made.record["spp"], spp or 0, text
+    return made.record["seconds"] - (start.record["seconds"] if start else 0.0), seconds, text
 
 
 def grow(
@@ -151,7 +155,7 @@ def grow(
     plugin = _independent(integrator, path_limits(world.integrator()))
     fixed = {"integrator": integrator, "seed": seed, "depends_on": depends_on(world, sensor)}
     if start is None:
-        before = {"spp": 0, "seconds": 0.0, "waves": 0}
+        before: dict[str, Any] = {"spp": 0, "seconds": 0.0, "waves": 0}
     else:
         before = start.record
         _check_same(start, fixed)
@@ -163,14 +167,15 @@ def grow(
     if spp is not None:
         wave = max(1, min(wave, (spp - before["spp"] + 1) // 2))
     sums = [np.zeros((height, width, 4)), np.zeros((height, width, 4))]
-    began, pairs, added, spent = time.perf_counter(), 0, 0, 0.0
+    began, spent = time.perf_counter(), 0.0
+    pairs = added = 0
     try:
         while spp is None or before["spp"] + added < spp:
             # As near to the time as whole pairs allow, and one always.
             if seconds is not None and pairs and spent * (pairs + 0.5) / pairs > seconds:
                 return
-            for half in sums:
-                number = before["waves"] + 2 * pairs + (half is sums[1])
+            for k, half in enumerate(sums):
+                number = before["waves"] + 2 * pairs + k
                 half += _wave(plugin, world, sensor, _wave_seed(seed, number), wave)
                 added += sampler.sample_count()  # samplers may round it up
             pairs += 1

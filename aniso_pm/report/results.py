@@ -13,6 +13,7 @@ from . import metrics, regions
 from .experiment import Measured
 from .methods import ISOTROPIC, Method
 from .plan import Plan
+from .runs import SET_UP
 
 SCHEMA = 1
 
@@ -160,9 +161,9 @@ def _method(measured: Measured, method: Method) -> dict[str, Any]:
     passes = [cell.record["passes"][-1] for cell in cells]
     stages = [cell.record["stages"] for cell in cells]
     per_pass = {
-        stage: float(np.mean([s[stage] / n for s, n in zip(stages, passes, strict=True) if n]))
+        stage: float(np.median([s[stage] / n for s, n in zip(stages, passes, strict=True) if n]))
         for stage in stages[0]
-        if stage != "pilot" and all(passes)
+        if stage not in SET_UP and all(passes)
     }
     return {
         "name": method.name,
@@ -171,7 +172,7 @@ def _method(measured: Measured, method: Method) -> dict[str, Any]:
         "bandwidth": method.bandwidth,
         "radius": cells[0].record["radius"],
         "compile_seconds": measured.warm[method.name]["compile_seconds"],
-        "pilot_seconds": float(np.mean([s.get("pilot", 0.0) for s in stages])),
+        "setup_seconds": float(np.median([sum(s.get(n, 0.0) for n in SET_UP) for s in stages])),
         "pass_seconds": per_pass,
         "cost": _cost(measured, method),
     }
@@ -190,7 +191,7 @@ def _cost(measured: Measured, method: Method) -> dict[str, float] | None:
 
     def duration(cell):
         stages = cell.record["stages"]
-        seconds = sum(t for stage, t in stages.items() if stage != "pilot")
+        seconds = sum(t for stage, t in stages.items() if stage not in SET_UP)
         return seconds / cell.record["passes"][-1]
 
     found = metrics.mean_ratio(

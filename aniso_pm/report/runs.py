@@ -1,8 +1,9 @@
 """One progressive run: the picture at hand when each budget of seconds ends.
 
-The clock counts what a warm rendering takes: choosing the bandwidth (the pilot), tracing the
-program in Python, photons, index, eye paths, gathering, the film. It does not count compilation,
-which :func:`warm_up` does before and tells apart, nor developing and looking at the pictures.
+The clock counts what a warm rendering takes: preparing the scene, choosing the bandwidth (the
+pilot), tracing the program in Python, photons, index, eye paths, gathering, the film. It does not
+count compilation, which :func:`warm_up` does before and tells apart, nor developing and looking at
+the pictures.
 
 ``aniso_pm`` renders passes of its own. Mitsuba's integrators are run again and again with other
 seeds and the pictures added up: with few samples at first, and with as many as fit into the time
@@ -23,6 +24,8 @@ from .methods import Method
 
 # Samples per pixel of one call of Mitsuba's integrators: each number compiles kernels of its own.
 CALLS = (1, 4, 16, 64)
+# Stages that come once, before the first pass.
+SET_UP = ("prepare", "pilot")
 # No call of more than one sample begins if it would not end in time, were it so much slower.
 _MARGIN = 1.25
 # Passes of a warm-up: buffers have found their size after the second.
@@ -132,8 +135,15 @@ def _passes(stage: Stage, parameters, seed: int, recorder: _Recorder) -> None:
     # The rule for time is the last resort: looking at pictures does not count here, but there.
     integrator = mi.load_dict(parameters | {"time": 4 * recorder.budgets[-1] + 60})
 
+    began, prepare = time.perf_counter(), None
+
     def after_pass(index, image, statistics):
+        nonlocal prepare
         stages = {name: t for name, t in statistics["seconds"].items() if name != "output"}
+        if prepare is None:
+            # What the integrator does before its own clock begins.
+            prepare = time.perf_counter() - began - sum(stages.values())
+        stages = {"prepare": prepare, **stages}
         recorder.run.radius = statistics["initial_radius"]
         if recorder.add(np.array(image), stages, index + 1, statistics["spp"]):
             raise _Enough
