@@ -132,17 +132,11 @@ def estimate(
     tolerance  of the sum, relative to the flux in the kernel, if the map has sums; see ``summed``.
     """
     ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
-    n = mi.Vector3f(points.n)
-    allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
-    caustics_only = points.caustic
+    counts = _filter(points, max_depth)
 
     def visit(total, slot, word, rho2, inside):
         reflected, missing, count = total
-        inside &= faces(word, n)
-        if max_depth:
-            inside &= segments(word) <= allowed
-        if caustics_only is not None:
-            inside &= is_caustic(word) | ~caustics_only
+        inside &= counts(word)
         light = photon_flux(photons, slot, inside) * dr.select(inside, dr.exp(-rho2), 0)
         if surface is not None:
             light *= surface.brdf(photon_direction(photons, slot, inside), inside)
@@ -154,10 +148,7 @@ def estimate(
 
     def visit_node(total, node):
         reflected, missing, count = total
-        limit = allowed if max_depth else None
-        light, inside, taken = summed.weighed(
-            photons.sums, node, ellipses, CUT2, n, tolerance, limit, caustics_only
-        )
+        light, inside, taken = summed.weighed(photons.sums, node, ellipses, CUT2, counts, tolerance)
         term = light - missing
         sum_ = reflected + term
         return (
@@ -173,6 +164,42 @@ def estimate(
     reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active, whole)
     area = dr.pi * dr.sqrt(dr.squared_norm(kernel.s)) * dr.sqrt(dr.squared_norm(kernel.t))
     return points.weight * reflected / (area * (KERNEL_MASS * photons.emitted)), count
+
+
+def _filter(points: GatherPoints, max_depth):
+    """A function of a photon's word: does the photon count at these gather points, if it is inside
+    the kernel and the cosine of normals is above ``least``?"""
+    n = mi.Vector3f(points.n)
+    allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
+
+    def counts(word, least=NORMAL_COS):
+        yes = faces(word, n, least)
+        if max_depth:
+            yes &= segments(word) <= allowed
+        if points.caustic is not None:
+            yes &= is_caustic(word) | ~points.caustic
+        return yes
+
+    return counts
+
+
+def photons_inside(
+    photons: PhotonMap, points: GatherPoints, kernel: PlaneKernel, radius, max_depth
+):
+    """Is the photon in each slot of the map one that :func:`estimate` sums up?  (one gather point)
+
+    Returns mi.Bool, as wide as there are photons.
+    """
+    ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
+    counts = _filter(points, max_depth)
+    found = dr.zeros(mi.Bool, photons.stored)
+
+    def visit(total, slot, word, rho2, inside):
+        dr.scatter(found, mi.Bool(True), slot, inside & counts(word))
+        return total
+
+    spatial.gather(photons.index, ellipses, CUT2, visit, mi.UInt32(0), mi.Bool(True))
+    return found
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,7 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
 
 def _hash(thing) -> str:
     text = re.sub(r"(sample_count|samples_per_wavefront|wavefront_size) = \d+", "", str(thing))
-    pieces = [text]
+    pieces: list[str | bytes] = [text]
     parameters = mi.traverse(thing)
     for index, key in enumerate(parameters.keys()):
         value = parameters[key]

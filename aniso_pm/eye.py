@@ -83,13 +83,14 @@ class GatherPoints:
     caustic: Any
 
 
-def map_tree(function, *trees):
+def map_tree(function, *trees: Any) -> Any:
     """Apply a function to the Dr.Jit arrays of equal trees of dataclasses (None stays None)."""
     first = trees[0]
     if first is None:
         return None
     if is_dataclass(first):
-        return type(first)(
+        kind: Any = type(first)
+        return kind(
             **{
                 f.name: map_tree(function, *(getattr(t, f.name) for t in trees))
                 for f in fields(first)
@@ -138,9 +139,9 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     return L, valid, take(points, curve_order(position))
 
 
-def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room):
+def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room, see=None):
     """One wavefront of eye paths, gather points into their columns: (radiance, valid, rows used,
-    columns)."""
+    columns). see: called as see(lane, depth, si, bsdf, bs, active) where paths scatter."""
 
     def push(point, active):
         slot = dr.scatter_inc(rows, mi.UInt32(0), active)
@@ -152,7 +153,7 @@ def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room):
 
         map_tree(put, points, point)
 
-    L, valid = _walk(scene, sampler, ray, options, push)
+    L, valid = _walk(scene, sampler, ray, options, push, see)
     return L, valid, rows, points
 
 
@@ -183,7 +184,7 @@ def _blank(o: WalkOptions) -> GatherPoints:
 
 
 @dr.syntax
-def _walk(scene, sampler, ray, options, push):
+def _walk(scene, sampler, ray, options, push, see):
     ctx = mi.BSDFContext()
     o = options
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
@@ -252,6 +253,8 @@ def _walk(scene, sampler, ray, options, push):
         # --- Sample the BSDF ---
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        if dr.hint(see is not None, mode="scalar"):
+            see(lane, depth, si, bsdf, bs, active)
         # Share of the gathered part in the sampled direction
         g = dr.select(is_receiver, mi.Spectrum(1), mi.Spectrum(0))
         if dr.hint(o.general, mode="scalar"):

@@ -60,6 +60,14 @@ def examine(scene: Prepared) -> list[Finding]:
             needs.unreadable,
         ),
         Finding(
+            "grooves without direction",
+            bool(needs.grainless),
+            "anisotropic meshes need texture coordinates; these have none"
+            if needs.grainless
+            else "none",
+            needs.grainless,
+        ),
+        Finding(
             "general receivers",
             bool(needs.general),
             "photons keep directions; the BSDF is evaluated for each"

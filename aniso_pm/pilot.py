@@ -24,7 +24,7 @@ FEWEST, MOST = 10_000, 5_000_000
 # Light paths and eye paths of the pilot, and photons that a disc must hold to be measured.
 _PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
 # Range of radii as shares of the scene's extent: 1e-5 · √2^27 = 0.1.
-_SMALLEST, _LARGEST, _STEPS = 1e-5, 0.1, 27
+_SMALLEST, LARGEST, _STEPS = 1e-5, 0.1, 27
 
 
 def camera_rays(sensor, seed: int):
@@ -36,6 +36,18 @@ def camera_rays(sensor, seed: int):
         mi.Float(sensor.shutter_open()), mi.Float(0.5), sampler.next_2d(), aperture
     )
     return ray
+
+
+def settle(scene: Prepared, sensor, seed: int, samples: int, count=None, radius=None):
+    """(light paths per pass, bandwidth of the first pass): what is not given is chosen.
+
+    samples: eye samples of a pass.
+    """
+    if not count or not radius:
+        rays = camera_rays(sensor, seed)
+        count = count or automatic_photon_count(scene, rays, seed, samples)
+        radius = radius or automatic_radius(scene.with_(photon_count=count), rays, seed)
+    return count, radius
 
 
 def _weighted_median(radii) -> float:
@@ -86,7 +98,7 @@ def automatic_radius(scene: Prepared, rays, seed: int) -> float:
             break
     median = _weighted_median(radius.numpy())
     more_photons = scene.settings.photon_count / pilot.settings.photon_count
-    return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), _LARGEST * extent)
+    return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), LARGEST * extent)
 
 
 def automatic_photon_count(scene: Prepared, rays, seed: int, eye_samples: int) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -138,6 +139,14 @@ class Prepared:
         tested = self.deep or self.use != "global"
         return limit if tested and 0 < limit <= photons.SEGMENTS_MAX else 0
 
+    @property
+    def kernel_options(self) -> density.KernelOptions:
+        """How gather points get their kernels."""
+        s = self.settings
+        return density.KernelOptions(
+            self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
+        )
+
     def photon_map(
         self,
         seed: int,
@@ -181,8 +190,9 @@ class Prepared:
             lap("index")
         return map_
 
-    def trace(self, sampler, ray, expected: int = 0):
-        """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``."""
+    def trace(self, sampler, ray, expected: int = 0, see=None):
+        """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``, and
+        ``eye.eye_paths`` for ``see``."""
         s = self.settings
         options = eye.WalkOptions(
             self.use,
@@ -196,7 +206,8 @@ class Prepared:
             bool(self.needs.general),
             s.gather_roughness,
         )
-        return eye.trace(self.scene, sampler, ray, options, expected, self.launch.eye)
+        launch = partial(self.launch.eye, see=see) if see else self.launch.eye
+        return eye.trace(self.scene, sampler, ray, options, expected, launch)
 
     def gather(
         self, map_, radius, seed: int, points: eye.GatherPoints, wavelengths=None
@@ -222,11 +233,7 @@ class Prepared:
         return parts
 
     def _gather(self, map_, radius, seed, points, surface) -> density.Gathered:
-        s = self.settings
-        options = density.KernelOptions(
-            self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
-        )
-        kernel, follows, degenerate = density.kernels(points, radius, options)
+        kernel, follows, degenerate = density.kernels(points, radius, self.kernel_options)
         L, count = density.estimate(
             map_,
             points,
@@ -235,10 +242,10 @@ class Prepared:
             self.gather_depth,
             mi.Bool(True),
             surface,
-            s.gather_tolerance,
+            self.settings.gather_tolerance,
         )
         lost = mi.Bool(False)
-        if s.edge_compensation:
+        if self.settings.edge_compensation:
             inverse, lost = density.probe_surface(
                 self.scene, seed, points, kernel, radius, count > 0
             )

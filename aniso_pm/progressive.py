@@ -23,7 +23,7 @@ from . import digest, memory, state
 from . import film as films
 from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .errors import is_interrupt
-from .pilot import automatic_photon_count, automatic_radius, camera_rays, photons_per_path
+from .pilot import LARGEST, photons_per_path, settle
 from .prepared import EYE, PROBE, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
 from .stopping import Stopping
@@ -32,6 +32,10 @@ from .stopping import Stopping
 WAVEFRONT = 1 << 21
 # Passes that make the colours of a spectral picture right within about a percent.
 _SPECTRAL_PASSES = 16
+# Anisotropic meshes without texture coordinates that warnings name.
+_NAMED = 3
+# Photons in the mean kernel below which a radius that was given cannot be meant.
+_FEWEST_IN_KERNEL = 0.1
 # What a pass counts.
 _COUNTS = (
     "photons_emitted",
@@ -101,6 +105,7 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
         run.stopping.close()
     run.finish()
     _warn(statistics)
+    _warn_about_radius(scene, statistics)
     return Rendered(run.map, run.radius, run.variance)
 
 
@@ -148,7 +153,16 @@ class _Run:
         """Pilot, or the state of an earlier run."""
         if not self.scene.scene.emitters():
             mi.Log(
-                mi.LogLevel.Warn, "aniso_pm: the scene has no emitters; the picture will be black"
+                mi.LogLevel.Warn,
+                "aniso_pm: the scene has no emitters; the picture will be black. Add one, or give "
+                'a shape the emitter "area"',
+            )
+        for surface in self.scene.needs.grainless[:_NAMED]:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'aniso_pm: the mesh "{surface}" is anisotropic but has no texture coordinates: '
+                "its grooves run along the first edge of every triangle. Give it texture "
+                "coordinates (u along the grooves' alpha_u)",
             )
         passes = self.scene.settings.passes
         if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
@@ -163,12 +177,10 @@ class _Run:
         known = earlier.identity if earlier else {}
         count = settings.photon_count or known.get("photon count")
         self.radius0 = settings.initial_radius or known.get("initial radius")
-        if not count or not self.radius0:
-            rays = camera_rays(self.sensor, self.seed)
-            samples = self.shares.each * films.pixel_count(self.film)
-            count = count or automatic_photon_count(self.scene, rays, self.seed, samples)
-            self.scene = self.scene.with_(photon_count=count)
-            self.radius0 = self.radius0 or automatic_radius(self.scene, rays, self.seed)
+        samples = self.shares.each * films.pixel_count(self.film)
+        count, self.radius0 = settle(
+            self.scene, self.sensor, self.seed, samples, count, self.radius0
+        )
         self.scene = self.scene.with_(photon_count=count)
         self.plan = memory.plan(self.scene, *self._job())
         self.scene = replace(self.scene, light_wavefront=self.plan.light_paths)
@@ -455,6 +467,25 @@ def _warn(statistics):
             mi.LogLevel.Warn,
             f"aniso_pm: {statistics['eye_samples_rejected']} of {statistics['eye_samples']} eye "
             "samples were not finite and count as black",
+        )
+
+
+def _warn_about_radius(scene, statistics):
+    """A radius that somebody has chosen may be right in other units."""
+    radius, points = scene.settings.initial_radius, statistics["gather_points"]
+    if not radius or not points or not statistics["photons_stored"]:
+        return
+    mean = statistics["photons_gathered"] / points
+    wrong = None
+    if mean < _FEWEST_IN_KERNEL:
+        wrong = f"kernels hold {mean:.2g} photons in the mean, the rest is noise"
+    elif radius > LARGEST * scene.extent:
+        wrong = "kernels reach across much of it and blur everything"
+    if wrong:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'aniso_pm: parameter "initial_radius" is {radius:g} in a scene that is '
+            f"{scene.extent:.3g} large: {wrong}. Lengths are in world units; 0 is automatic",
         )
 
 

@@ -141,23 +141,16 @@ def _word(node: _Node):
     return word | dr.select(node.caustic, mi.UInt32(1 << 31), mi.UInt32(0))
 
 
-def weighed(sums: Sums, node, ellipses: Ellipses, cut2, n, tolerance, allowed, caustics_only):
+def weighed(sums: Sums, node, ellipses: Ellipses, cut2, counts, tolerance):
     """(flux times weight, centroid inside the ellipse?, may it be taken?) of a node.
 
-    n              normal of the receiver.
-    allowed        most segments of a photon's path, or None where they are not limited.
-    caustics_only  count only caustic photons? None where none of the receivers does.
+    counts(word, cosine)  does a photon count, if its normal is that near to the receiver's?
     """
     place = dr.gather(mi.Vector4f, sums.place, node)
     d = mi.Vector3f(place.x, place.y, place.z) - ellipses.center
     a, b = dr.dot(ellipses.a, d), dr.dot(ellipses.b, d)
     rho2 = a * a + b * b
-    word = dr.reinterpret_array(mi.UInt32, place.w)
-    taken = dr.isfinite(rho2) & photons.faces(word, n, _COSINE)
-    if allowed is not None:
-        taken &= photons.segments(word) <= allowed
-    if caustics_only is not None:
-        taken &= photons.is_caustic(word) | ~caustics_only
+    taken = dr.isfinite(rho2) & counts(dr.reinterpret_array(mi.UInt32, place.w), _COSINE)
     # x² + y² <= tolerance/2 has been tested; the other half is for the colours.
     steep = dr.maximum(dr.squared_norm(ellipses.a), dr.squared_norm(ellipses.b))
     slack = dr.square(_STEEPEST * dr.gather(mi.Float, sums.spread, node)) * steep

@@ -179,6 +179,8 @@ class AnisoPhotonMapper:
             'passes': 16
     """
 
+    hide_emitters: bool  # set by Mitsuba's own constructor
+
     def __init__(self, props):
         # Mitsuba's own complaint names neither the value nor what it may be.
         if "hide_emitters" in props and type(props["hide_emitters"]) is not bool:

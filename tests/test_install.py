@@ -177,3 +177,15 @@ def test_the_wheel_works_without_the_sources(built, tmp_path):
         copied = sorted((tmp_path / "here").glob(kind))
         shipped = sorted((ROOT / "scenes").glob(kind))
         assert [p.read_bytes() for p in copied] == [p.read_bytes() for p in shipped] != []
+
+
+def test_python_started_in_a_clone_finds_the_plugins_beside_the_package(tmp_path):
+    """As after `pip install .` in a clone, whose folder hides what is installed."""
+    code = (
+        "import sys\n"
+        "sys.meta_path = [f for f in sys.meta_path if 'editable' not in repr(f).lower()]\n"
+        f"sys.path.insert(0, {str(ROOT)!r})\n"
+        "import aniso_pm.plugins.integrator as i; print(i.__file__)"
+    )
+    run = run_python(code, tmp_path)
+    assert run.stdout.strip() == str(ROOT / "plugins" / "integrator.py"), run.stderr
