@@ -125,8 +125,10 @@ def plan(scene: Prepared, job: Job, count_photons: Callable[[], float]) -> Plan:
         large = [f for f in flights if flights[f] and getattr(result, f) > SMALLEST]
         if not large:
             raise Unsupported(_refusal(result, said))
-        name = max(large, key=flights.get)
-        result = replace(result, **{name: _half(getattr(result, name))})
+        if max(large, key=lambda f: flights[f]) == "light_paths":
+            result = replace(result, light_paths=_half(result.light_paths))
+        else:
+            result = replace(result, eye_samples=_half(result.eye_samples))
     return result
 
 
@@ -141,11 +143,11 @@ def _refusal(plan: Plan, said: str) -> str:
     shown = {f"the film of {job.pixels} pixels": parts["film"], "the smallest wavefronts": flights}
     if job.stored:
         shown = {f"a map of {job.stored:.2g} photons": parts["photons"]} | shown
-    shown = ", ".join(f"{_gib(size)} for {what}" for what, size in shown.items())
+    each = ", ".join(f"{_gib(size)} for {what}" for what, size in shown.items())
     remedy = '"photon_count"' if parts["photons"] > parts["film"] else "the size of the film"
     return (
         f'aniso_pm: parameter "max_memory" is {said}, but rendering takes about '
-        f"{_gib(plan.bytes)} GiB ({shown}); lower {remedy} or give a larger max_memory"
+        f"{_gib(plan.bytes)} GiB ({each}); lower {remedy} or give a larger max_memory"
     )
 
 
@@ -185,13 +187,14 @@ def cgroup_available(root: Path = Path("/")) -> float:
     for line in groups:
         _, controllers, path = line.split(":", 2)
         if controllers == "":
-            top, names = "sys/fs/cgroup", ("memory.max", "memory.current", "inactive_file")
+            top = root / "sys/fs/cgroup"
+            names = "memory.max", "memory.current", "inactive_file"
         elif "memory" in controllers.split(","):
-            top = "sys/fs/cgroup/memory"
+            top = root / "sys/fs/cgroup/memory"
             names = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
         else:
             continue
-        top, group = root / top, root / top / path.lstrip("/")
+        group = top / path.lstrip("/")
         # A limit may be that of any group around this one. Inside a container the path may be one
         # that only the host knows.
         for directory in (group, *group.parents):
