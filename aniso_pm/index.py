@@ -9,8 +9,8 @@ bytes, one load, a few per cent too large. The traversal needs no stack: a node 
 out (1 means: finished).
 
 A neighbourhood is an elliptical cylinder {d : (a·d)² + (b·d)² <= cut², |c·d| <= 1} around a
-centre. Its test against a box costs the same at any aspect ratio, so a thin ellipse visits the
-points along it, not those of a disc around it.
+centre. It meets a box if their projections meet on its own axes and on those of the box. That costs
+the same at any aspect ratio: a thin ellipse visits the points along it, not those of a disc.
 
 This module knows points and ellipses; what the points carry is the caller's.
 """
@@ -42,6 +42,11 @@ class Ellipses:
     a: Any
     b: Any
     c: Any
+
+    def reach(self, cut2: float):
+        """Half extents along x, y and z, a little more than exact; a, b and c are orthogonal."""
+        s, t, n = (v * dr.rcp(dr.squared_norm(v)) for v in (self.a, self.b, self.c))
+        return (1 + 1e-5) * (dr.sqrt(cut2 * (s * s + t * t)) + dr.abs(n))
 
     @staticmethod
     def from_axes(center, s, t, n, half_thickness) -> Ellipses:
@@ -232,7 +237,7 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, 
     center, a, b, c = ellipses.center, ellipses.a, ellipses.b, ellipses.c
     n_leaves = dr.opaque(mi.UInt32, index.n_leaves)
     points, boxes = index.points, index.boxes
-    half_extent = 0.5 * index.extent
+    half_extent, reach = 0.5 * index.extent, mi.Vector3f(ellipses.reach(cut2))
     abs_a, abs_b, abs_c = dr.abs(a), dr.abs(b), dr.abs(c)
     if dr.hint(whole is not None, mode="scalar"):
         tolerance, rim, visit_node = dr.opaque(mi.Float, whole[0]), whole[1], whole[2]
@@ -249,7 +254,8 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, 
             da, db, dc = dr.abs(dr.dot(a, mid)), dr.abs(dr.dot(b, mid)), dr.abs(dr.dot(c, mid))
             wa, wb, wc = dr.dot(abs_a, half), dr.dot(abs_b, half), dr.dot(abs_c, half)
             near_a, near_b = dr.maximum(da - wa, 0), dr.maximum(db - wb, 0)
-            hit = ~empty & (near_a * near_a + near_b * near_b <= cut2) & (dc - wc <= 1)
+            hit = ~empty & dr.all(dr.abs(mid) <= half + reach)
+            hit &= (near_a * near_a + near_b * near_b <= cut2) & (dc - wc <= 1)
             if dr.hint(whole is not None, mode="scalar"):
                 far_a, far_b = da + wa, db + wb
                 on_rim = far_a * far_a + far_b * far_b > cut2
