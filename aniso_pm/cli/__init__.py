@@ -16,7 +16,7 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import InputError, is_interrupt, one_line
 
-from . import examine, render
+from . import bench, examine, render
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -80,5 +80,6 @@ for command in (
     examine.inspect,
     examine.stability,
     examine.doctor,
+    bench.bench,
 ):
     app.command()(command)
