@@ -107,9 +107,11 @@ def _even(photons, queries, repetitions, speed) -> Iterator[Row]:
 def _uneven(photons, queries, repetitions, speed) -> Iterator[Row]:
     rng = np.random.default_rng(2)
     places = walls.uneven(rng, photons, walls.CROWD)
-    # Half of the queries where the photons are, half where they are not.
-    at = walls.uneven(rng, queries, 0.5)
-    radius = walls.uneven_radius(photons, at)
+    # Half of the queries where the photons are, half where they are not; none reaches from there
+    # into the crowd, or it would find thousands.
+    inside, outside = walls.uneven_radii(photons)
+    at = walls.uneven(rng, queries, 0.5, outside)
+    radius = np.where(at.crowded, inside, outside)
     points, word = places.points(), dr.zeros(mi.UInt32, photons)
     flux = dr.full(mi.Float, 1, 4 * photons)
     dr.eval(points, word, flux)
@@ -119,7 +121,7 @@ def _uneven(photons, queries, repetitions, speed) -> Iterator[Row]:
 
     # The cells hold up to a sixth of all photons: a few queries of the grid take long enough.
     few = 256
-    cells = grid.build(points, word, float(radius.max()))
+    cells = grid.build(points, word, outside)
     e_few = walls.ellipses(rng, at.some(few), radius[:few], 1)
     rival = interleaved(
         {"g": lambda: run(lambda: grid.gather(cells, e_few, walls.CUT2, visit, zero, True))}, 1

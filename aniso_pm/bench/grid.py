@@ -61,6 +61,7 @@ def gather(grid: Grid, ellipses: Ellipses, cut2: float, visit, total, rows: bool
     center, a, b, c = ellipses.center, ellipses.a, ellipses.b, ellipses.c
     nx, ny, nz = (dr.opaque(mi.Int32, n) for n in grid.resolution)
     cell = mi.Vector3i((center - grid.low) / grid.cell)
+    start, points = grid.start, grid.points
 
     near = mi.UInt32(0)
     while near < (9 if rows else 27):
@@ -72,10 +73,10 @@ def gather(grid: Grid, ellipses: Ellipses, cut2: float, visit, total, rows: bool
             z, last = cell.z + mi.Int32(near // 9) - 1, x
         exists = (x >= 0) & (last < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)
         row = (z * ny + y) * nx
-        slot = dr.gather(mi.UInt32, grid.start, mi.UInt32(row + x), exists)
-        end = dr.gather(mi.UInt32, grid.start, mi.UInt32(row + last + 1), exists)
+        slot = dr.gather(mi.UInt32, start, mi.UInt32(row + x), exists)
+        end = dr.gather(mi.UInt32, start, mi.UInt32(row + last + 1), exists)
         while slot < end:
-            point = dr.gather(mi.Vector4f, grid.points, slot)
+            point = dr.gather(mi.Vector4f, points, slot)
             d = mi.Vector3f(point.x, point.y, point.z) - center
             da, db = dr.dot(a, d), dr.dot(b, d)
             rho2 = da * da + db * db

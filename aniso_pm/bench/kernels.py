@@ -6,22 +6,10 @@ from collections.abc import Iterator
 
 import drjit as dr
 import mitsuba as mi
+from aniso_pm.history import recorded
 
 from . import rooms
 from .row import Row
-
-
-def history(render) -> list[dict]:
-    """Dr.Jit's records of the kernels that ``render()`` launches, compiled ones only."""
-    before = dr.flag(dr.JitFlag.KernelHistory)
-    dr.kernel_history_clear()
-    dr.set_flag(dr.JitFlag.KernelHistory, True)
-    try:
-        render()
-        dr.sync_thread()
-        return [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-    finally:
-        dr.set_flag(dr.JitFlag.KernelHistory, before)
 
 
 def hashes(scene, kernel: str) -> set[str]:
@@ -33,8 +21,9 @@ def hashes(scene, kernel: str) -> set[str]:
         "initial_radius": 0.1,
     }
     integrator = mi.load_dict(integrator)
-    records = history(lambda: dr.eval(mi.render(scene, integrator=integrator, spp=1)))
-    return {k["hash"] for k in records}
+    with recorded() as records:
+        dr.eval(mi.render(scene, integrator=integrator, spp=1))
+        return {k["hash"] for k in records()}
 
 
 def measure(quick: bool) -> Iterator[Row]:

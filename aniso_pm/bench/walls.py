@@ -15,7 +15,8 @@ WALLS = 5
 PER_QUERY = 50
 # a² + b² at which kernels are cut, as in ``density``.
 CUT2 = 4.0
-# Uneven: this share of the photons lies in a square of this area (1 % of all) on the first wall.
+# Uneven: this share of the photons lies in a square of this area (1 % of all) in the
+# middle of the first wall.
 CROWD, CROWD_AREA = 0.99, 0.01 * WALLS
 # Extent along the normal in bandwidths, as in ``density``.
 _SLAB = 0.5
@@ -43,16 +44,21 @@ def even(rng, count: int) -> Places:
     return _on_walls(rng.random((count, 2)), rng.integers(0, WALLS, count))
 
 
-def uneven(rng, count: int, share: float) -> Places:
-    """That share of the points in the crowd's square, the others uniform outside it."""
+def uneven(rng, count: int, share: float, margin: float = 0.0) -> Places:
+    """That share of the points in the crowd's square, the others uniform, at least ``margin``
+    outside it."""
     uv, wall = rng.random((count, 2)), rng.integers(0, WALLS, count)
-    side = CROWD_AREA**0.5
     crowded = rng.random(count) < share
-    while (stray := ~crowded & (wall == 0) & (uv < side).all(1)).any():
+    while (stray := ~crowded & (wall == 0) & _in_square(uv, margin)).any():
         uv[stray] = rng.random((stray.sum(), 2))
-    uv[crowded] *= side
+    uv[crowded] = 0.5 + CROWD_AREA**0.5 * (uv[crowded] - 0.5)
     wall[crowded] = 0
     return _on_walls(uv, wall)
+
+
+def _in_square(uv, margin: float = 0.0):
+    """In the middle of a wall; or that near to it."""
+    return (np.abs(uv - 0.5) < CROWD_AREA**0.5 / 2 + margin).all(1)
 
 
 def _on_walls(uv, wall) -> Places:
@@ -65,8 +71,7 @@ def _on_walls(uv, wall) -> Places:
         position[np.ix_(here, others)] = uv[here]
         position[here, k] = side[here]
         normal[here, k] = 1 - 2 * side[here]
-    crowded = (wall == 0) & (uv < CROWD_AREA**0.5).all(1)
-    return Places(position, normal, crowded)
+    return Places(position, normal, (wall == 0) & _in_square(uv))
 
 
 def even_radius(photons: int) -> float:
@@ -74,11 +79,11 @@ def even_radius(photons: int) -> float:
     return float(np.sqrt(PER_QUERY * WALLS / (np.pi * photons)))
 
 
-def uneven_radius(photons: int, places: Places) -> np.ndarray:
-    """The same of ``uneven``, by the density at each place."""
+def uneven_radii(photons: int) -> tuple[float, float]:
+    """The same of ``uneven``: in the crowd's square, outside it."""
     inside = CROWD * photons / CROWD_AREA
     outside = (1 - CROWD) * photons / (WALLS - CROWD_AREA)
-    return np.sqrt(PER_QUERY / (np.pi * np.where(places.crowded, inside, outside)))
+    return tuple(float(np.sqrt(PER_QUERY / (np.pi * density))) for density in (inside, outside))
 
 
 def ellipses(rng, places: Places, cut_radius, aspect: float) -> Ellipses:
@@ -106,7 +111,9 @@ def visitor(flux):
     def visit(total: Any, slot, word, rho2, inside):
         power, count = total
         packed = dr.gather(mi.Vector4f, flux, slot, inside)
-        power += mi.Color3f(packed.x, packed.y, packed.z) * dr.select(inside, dr.exp(-rho2), 0)
+        weight = dr.select(inside, dr.exp(-rho2), 0)
+        # Not +=: that would change the zero that the next sum starts from.
+        power = power + mi.Color3f(packed.x, packed.y, packed.z) * weight
         return power, count + dr.select(inside, mi.UInt32(1), 0)
 
     return visit, (mi.Color3f(0), mi.UInt32(0))
