@@ -251,6 +251,7 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch):
             return count, int(rejected[0]), photons
         capacity = count
         del photons
+        spatial.give_back(count)
 
 
 def light_paths(scene, source, sampler, options, photons, stored, rejected, room):

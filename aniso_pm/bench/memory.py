@@ -28,9 +28,9 @@ def measure(quick: bool) -> Iterator[Row]:
         yield Row("memory", None, "bytes", None, "resident memory can be read on Linux only")
         return
     for light_paths in (700_000,) if quick else (700_000, 3_000_000):
-        yield from _map_rows(_in_process("map_memory", light_paths))
+        yield from _map_rows(in_process("map_memory", light_paths))
     if not quick:
-        yield _large_row(_in_process("large_memory"))
+        yield _large_row(in_process("large_memory"))
 
 
 def _map_rows(found: dict[str, Any]) -> Iterator[Row]:
@@ -64,7 +64,7 @@ def _large_row(found: dict[str, Any]) -> Row:
     )
 
 
-def _in_process(function: str, *arguments) -> dict[str, Any]:
+def in_process(function: str, *arguments) -> dict[str, Any]:
     code = (
         "import aniso_pm, json, mitsuba as mi; "
         f"mi.set_variant('{mi.variant()}'); from aniso_pm.bench import memory; "
@@ -128,7 +128,7 @@ def large_memory() -> dict[str, Any]:
     scene = mi.load_dict(rooms.room(4096))
     integrator = {
         "type": "aniso_pm",
-        "photon_count": 13_000_000,
+        "photon_count": 8_000_000,
         "initial_radius": 0.002,
         "max_depth": 6,
     }

@@ -50,7 +50,7 @@ def uneven(rng, count: int, share: float, margin: float = 0.0) -> Places:
     uv, wall = rng.random((count, 2)), rng.integers(0, WALLS, count)
     crowded = rng.random(count) < share
     while (stray := ~crowded & (wall == 0) & _in_square(uv, margin)).any():
-        uv[stray] = rng.random((stray.sum(), 2))
+        uv[stray], wall[stray] = rng.random((stray.sum(), 2)), rng.integers(0, WALLS, stray.sum())
     uv[crowded] = 0.5 + CROWD_AREA**0.5 * (uv[crowded] - 0.5)
     wall[crowded] = 0
     return _on_walls(uv, wall)
