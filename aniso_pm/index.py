@@ -31,6 +31,8 @@ _QUEUE = 15
 # A box is its lower corner and its size as three numbers of 10 bits, relative to the whole cube:
 # 5 of exponent, 5 of mantissa, rounded up. This is the exponent of the smallest as a float has it.
 _EXPONENT = 96 << 23
+# Points from which on peak memory counts.
+_LARGE = 1 << 20
 _EMPTY = 1 << 30  # in the word of the sizes: nothing in the box
 
 
@@ -88,7 +90,30 @@ def curve_order(positions):
     """Permutation (UInt32) that sorts points along a Hilbert curve through them."""
     low, extent = _cube(positions)
     scale = dr.select(extent > 0, (2**_BITS - 1) / extent, 0)
-    return dr.argsort(_hilbert((positions - low) * scale))
+    code = _hilbert((positions - low) * scale)
+    # The sort is stable, so two of halves are one of the whole: as fast, and less memory.
+    high, low = mi.UInt32(code >> 32), mi.UInt32(code)
+    dr.eval(high, low)
+    del code
+    order = dr.argsort(low)
+    del low
+    high = dr.gather(mi.UInt32, high, order)
+    dr.eval(order, high)
+    give_back(dr.width(positions))
+    order = dr.gather(mi.UInt32, order, dr.argsort(high))
+    dr.eval(order)
+    return order
+
+
+def give_back(count: int):
+    """Let go of memory that Dr.Jit keeps for later, where that of ``count`` points is much.
+
+    What is kept serves blocks of the same size only: without this, the peak is the sum of all
+    sizes that ever were. Small blocks are worth keeping for the next pass.
+    """
+    if count >= _LARGE:
+        dr.sync_thread()
+        dr.flush_malloc_cache()
 
 
 def _cube(positions):
@@ -104,13 +129,18 @@ def build(positions, word) -> tuple[Index, Any]:
     with each point.
     """
     count = dr.width(positions)
-    order = curve_order(positions)
     _, extent = _cube(positions)
+    order = curve_order(positions)
+    give_back(count)
     positions = dr.gather(mi.Point3f, positions, order)
     word = dr.reinterpret_array(mi.Float, dr.gather(mi.UInt32, word, order))
     used_leaves = -(-count // LEAF)
     points = dr.full(mi.Float, dr.nan, 4 * LEAF * used_leaves)
     dr.scatter(points, mi.Vector4f(positions.x, positions.y, positions.z, word), _iota(count))
+    dr.eval(points, extent)
+    # A caller that keeps none of them makes room for the boxes.
+    del positions, word
+    give_back(count)
 
     n_leaves = 1
     while n_leaves < used_leaves:
@@ -130,7 +160,8 @@ def build(positions, word) -> tuple[Index, Any]:
             combine(dr.gather(mi.Point3f, v, left), dr.gather(mi.Point3f, v, left + 1))
             for v, combine in ((low, dr.minimum), (high, dr.maximum))
         )
-    dr.eval(points, order, extent)
+    del low, high
+    give_back(count)
     return Index(count, n_leaves, points, boxes, extent), order
 
 
