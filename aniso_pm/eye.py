@@ -38,6 +38,7 @@ class WalkOptions:
     min_segments   segments of the shortest light path that the map holds (2; 1 where the scene has
                    direct light that only the map knows).
     hide_emitters  directly visible emitters are invisible.
+    gathers        there is a map to be read; without it no gather point is left.
     follow_lobes   keep the anisotropic lobe of the last glossy vertex (``needs.lobes``).
     deep           the scene has surfaces to walk on (``needs.chains``).
     general        the scene has receivers that are not Lambertian (``needs.general``).
@@ -49,6 +50,7 @@ class WalkOptions:
     rr_depth: int
     min_segments: int
     hide_emitters: bool
+    gathers: bool
     follow_lobes: bool
     deep: bool
     general: bool
@@ -112,6 +114,10 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     expected  gather points to make room for; with too few the same paths are traced again.
     launch    ``eye_paths``, or that function frozen.
     """
+    if not options.gathers:
+        L, valid, _, _ = (launch or eye_paths)(scene, sampler, ray, options, None, None, None)
+        dr.eval(L, valid)
+        return L, valid, None
     # Without mixed receivers a path ends where it leaves its first gather point.
     single = options.use == "global" and not options.general
     capacity = dr.width(ray) if single else max(2 * dr.width(ray), expected + expected // 8)
@@ -240,7 +246,9 @@ def _walk(scene, sampler, ray, options, push, see):
         L[here & ~finite] = dr.nan  # counted and dropped later
         if dr.hint(o.follow_lobes, mode="scalar"):
             path.distance += dr.select(active, si.t, 0)
-        push(_point(o, lane, si, ray, weight, depth, path, lambertian, scattered), here & finite)
+        if dr.hint(o.gathers, mode="scalar"):
+            point = _point(o, lane, si, ray, weight, depth, path, lambertian, scattered)
+            push(point, here & finite)
 
         # --- Sample the BSDF ---
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)

@@ -15,13 +15,14 @@ def pixel_count(film) -> int:
     return width * height
 
 
-def sample_rays(sensor, sampler, spp, wavelength):
+def sample_rays(sensor, sampler, spp, wavelength, first, pixels):
     """Camera rays of one wavefront: (ray, weight, position on the film), spp samples a pixel in
-    consecutive lanes. wavelength: the sample in [0, 1) that chooses wavelengths for all of them."""
+    consecutive lanes. first, pixels: which of them, row by row. wavelength: the
+    sample in [0, 1) that chooses wavelengths for all of them."""
     film = sensor.film()
-    width, height = _sampled_size(film)
-    lane = dr.arange(mi.UInt32, width * height * spp)
-    pixel = lane // dr.opaque(mi.UInt32, spp)
+    width, _ = _sampled_size(film)
+    lane = dr.arange(mi.UInt32, pixels * spp)
+    pixel = lane // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first)
     row = pixel // width
     corner = mi.Point2i(mi.Int32(pixel - row * width), mi.Int32(row)) - _border(film)
     corner += mi.Point2i(mi.ScalarPoint2i(film.crop_offset()))

@@ -39,7 +39,7 @@ def examine(scene: Prepared) -> list[Finding]:
             f"{scene.use}: photons are traced and gathered"
             if scene.needs_map
             else "no photon is traced: the scene is path traced",
-            needs.receivers or ["no surface gathers"],
+            _why_map(scene) + (needs.receivers or ["no surface gathers"]),
         ),
         Finding(
             "caustics, specular chains",
@@ -143,6 +143,15 @@ def kernels(scene: Prepared) -> Finding:
         map_ = scene.with_(photon_count=1024).photon_map(0, 0, 0, wavelengths, lap)
         scene.radiance(sampler, rays, map_, radius, 0, lap=lap)
     return Finding("kernels", True, f"{number} kernels, {operations:,} operations", evidence)
+
+
+def _why_map(scene: Prepared) -> list[str]:
+    """What ``map=auto`` went by."""
+    if scene.settings.map != "auto":
+        return []
+    needs = scene.needs
+    cause = [f"light over {e}" for e in needs.chains] + [f"light of {e}" for e in needs.unseen]
+    return [f"map=auto: {cause[0] if cause else 'nothing casts caustics'}"]
 
 
 def as_text(findings: list[Finding]) -> str:

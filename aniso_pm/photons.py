@@ -107,16 +107,25 @@ def build_map(
     expected: int = 0,
     launch=None,
     lap=lambda stage: None,
+    wavefront: int | None = None,
 ):
     """Trace ``photon_count`` light paths from ``source`` and index what they leave.
 
     expected  photons to make room for; with too little room the same paths are traced again.
     launch    ``light_paths``, or that function frozen.
     lap       called with the name of each stage that ends.
+    wavefront  light paths traced at once; None: WAVEFRONT.
     """
     room = max(expected, int(_FIRST_GUESS * photon_count))
     stored, rejected, photons = _trace(
-        scene, source, photon_count, seed, options, room, launch or light_paths
+        scene,
+        source,
+        photon_count,
+        seed,
+        options,
+        room,
+        launch or light_paths,
+        wavefront or WAVEFRONT,
     )
     lap("photons")
     if stored == 0:
@@ -237,7 +246,7 @@ def _cut(photons, name: str, entries: int):
     return type(column)(*(dr.reshape(type(x), x, entries, shrink=True) for x in column))
 
 
-def _trace(scene, source, photon_count, seed, options, capacity, launch):
+def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefront):
     """(stored, rejected, _Photons with buffers of at least ``stored`` entries)."""
     while True:
         capacity = max(capacity + capacity // 16, 1024)
@@ -249,10 +258,10 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch):
         )
         stored, rejected = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0)
         room = dr.opaque(mi.UInt32, capacity)
-        for first in range(0, photon_count, WAVEFRONT):
+        for first in range(0, photon_count, wavefront):
             sampler = mi.load_dict({"type": "independent"})
             sampler.seed(
-                mi.sample_tea_32(seed, first // WAVEFRONT)[0], min(WAVEFRONT, photon_count - first)
+                mi.sample_tea_32(seed, first // wavefront)[0], min(wavefront, photon_count - first)
             )
             photons, stored, rejected = launch(
                 scene, source, sampler, options, photons, stored, rejected, room

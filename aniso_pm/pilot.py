@@ -58,6 +58,12 @@ def _weighted_median(radii) -> float:
     return float(radii[np.searchsorted(light, 0.5 * light[-1])])
 
 
+def photons_per_path(scene: Prepared, seed: int) -> float:
+    """Photons that a light path leaves in the mean."""
+    map_ = scene.with_(photon_count=_PATHS).photon_map(stream_seed(seed, PILOT), 0)
+    return map_.stored / max(map_.emitted, 1)
+
+
 def automatic_radius(scene: Prepared, rays, seed: int) -> float:
     """Bandwidth (world units) at which kernels hold PHOTONS_PER_KERNEL photons in the median.
 

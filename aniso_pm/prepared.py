@@ -55,6 +55,7 @@ class Prepared:
     hide_emitters: bool
     emission: emission.Emission | None
     launch: Launch = Launch()
+    light_wavefront: int | None = None  # light paths at once; None: photons.WAVEFRONT
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -90,13 +91,21 @@ class Prepared:
 
     @property
     def use(self) -> str:
-        """How eye paths use the map; see ``eye``."""
-        return "final_gather" if self.settings.final_gather else self.settings.map
+        """How eye paths use the map; see ``eye``. ``auto`` is "global" where light comes over
+        surfaces that paths walk on, or from emitters that only photons find. Elsewhere it is
+        "caustic", which stores and gathers nothing there: path tracing is faster."""
+        if self.settings.final_gather:
+            return "final_gather"
+        if self.settings.map == "auto":
+            return "global" if self.deep or self.needs.unseen else "caustic"
+        return self.settings.map
 
     @property
     def crowding(self) -> int:
         """Share of a wavefront's eye paths that may be traced at once: where paths leave gather
         points at several vertices, fewer of them fit into the same memory."""
+        if not self.needs_map:
+            return 1
         if self.use == "caustic":
             return 8
         return 2 if self.use == "final_gather" or self.needs.general else 1
@@ -174,6 +183,7 @@ class Prepared:
             expected,
             self.launch.light,
             lap,
+            self.light_wavefront,
         )
         if s.gather_tolerance > 0 and map_.stored:
             map_ = replace(map_, sums=summed.build(map_))
@@ -190,7 +200,8 @@ class Prepared:
             s.rr_depth,
             self.min_segments,
             self.hide_emitters,
-            self.follow_lobes,
+            self.needs_map,
+            self.follow_lobes and self.needs_map,
             self.deep,
             bool(self.needs.general),
             s.gather_roughness,
