@@ -9,8 +9,8 @@ bytes, one load, a few per cent too large. The traversal needs no stack: a node 
 out (1 means: finished).
 
 A neighbourhood is an elliptical cylinder {d : (a·d)² + (b·d)² <= cut², |c·d| <= 1} around a
-centre. Its test against a box costs the same at any aspect ratio, so a thin ellipse visits the
-points along it, not those of a disc around it.
+centre. It meets a box if their projections meet on its own axes and on those of the box. That costs
+the same at any aspect ratio: a thin ellipse visits the points along it, not those of a disc.
 
 This module knows points and ellipses; what the points carry is the caller's.
 """
@@ -31,6 +31,8 @@ _QUEUE = 15
 # A box is its lower corner and its size as three numbers of 10 bits, relative to the whole cube:
 # 5 of exponent, 5 of mantissa, rounded up. This is the exponent of the smallest as a float has it.
 _EXPONENT = 96 << 23
+# Points from which on peak memory counts.
+_LARGE = 1 << 20
 _EMPTY = 1 << 30  # in the word of the sizes: nothing in the box
 
 
@@ -42,6 +44,11 @@ class Ellipses:
     a: Any
     b: Any
     c: Any
+
+    def reach(self, cut2: float):
+        """Half extents along x, y and z, a little more than exact; a, b and c are orthogonal."""
+        s, t, n = (v * dr.rcp(dr.squared_norm(v)) for v in (self.a, self.b, self.c))
+        return (1 + 1e-5) * (dr.sqrt(cut2 * (s * s + t * t)) + dr.abs(n))
 
     @staticmethod
     def from_axes(center, s, t, n, half_thickness) -> Ellipses:
@@ -83,7 +90,30 @@ def curve_order(positions):
     """Permutation (UInt32) that sorts points along a Hilbert curve through them."""
     low, extent = _cube(positions)
     scale = dr.select(extent > 0, (2**_BITS - 1) / extent, 0)
-    return dr.argsort(_hilbert((positions - low) * scale))
+    code = _hilbert((positions - low) * scale)
+    # The sort is stable, so two of halves are one of the whole: as fast, and less memory.
+    high, low = mi.UInt32(code >> 32), mi.UInt32(code)
+    dr.eval(high, low)
+    del code
+    order = dr.argsort(low)
+    del low
+    high = dr.gather(mi.UInt32, high, order)
+    dr.eval(order, high)
+    give_back(dr.width(positions))
+    order = dr.gather(mi.UInt32, order, dr.argsort(high))
+    dr.eval(order)
+    return order
+
+
+def give_back(count: int):
+    """Let go of memory that Dr.Jit keeps for later, where that of ``count`` points is much.
+
+    What is kept serves blocks of the same size only: without this, the peak is the sum of all
+    sizes that ever were. Small blocks are worth keeping for the next pass.
+    """
+    if count >= _LARGE:
+        dr.sync_thread()
+        dr.flush_malloc_cache()
 
 
 def _cube(positions):
@@ -99,13 +129,18 @@ def build(positions, word) -> tuple[Index, Any]:
     with each point.
     """
     count = dr.width(positions)
-    order = curve_order(positions)
     _, extent = _cube(positions)
+    order = curve_order(positions)
+    give_back(count)
     positions = dr.gather(mi.Point3f, positions, order)
     word = dr.reinterpret_array(mi.Float, dr.gather(mi.UInt32, word, order))
     used_leaves = -(-count // LEAF)
     points = dr.full(mi.Float, dr.nan, 4 * LEAF * used_leaves)
     dr.scatter(points, mi.Vector4f(positions.x, positions.y, positions.z, word), _iota(count))
+    dr.eval(points, extent)
+    # A caller that keeps none of them makes room for the boxes.
+    del positions, word
+    give_back(count)
 
     n_leaves = 1
     while n_leaves < used_leaves:
@@ -125,7 +160,8 @@ def build(positions, word) -> tuple[Index, Any]:
             combine(dr.gather(mi.Point3f, v, left), dr.gather(mi.Point3f, v, left + 1))
             for v, combine in ((low, dr.minimum), (high, dr.maximum))
         )
-    dr.eval(points, order, extent)
+    del low, high
+    give_back(count)
     return Index(count, n_leaves, points, boxes, extent), order
 
 
@@ -232,7 +268,7 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, 
     center, a, b, c = ellipses.center, ellipses.a, ellipses.b, ellipses.c
     n_leaves = dr.opaque(mi.UInt32, index.n_leaves)
     points, boxes = index.points, index.boxes
-    half_extent = 0.5 * index.extent
+    half_extent, reach = 0.5 * index.extent, mi.Vector3f(ellipses.reach(cut2))
     abs_a, abs_b, abs_c = dr.abs(a), dr.abs(b), dr.abs(c)
     if dr.hint(whole is not None, mode="scalar"):
         tolerance, rim, visit_node = dr.opaque(mi.Float, whole[0]), whole[1], whole[2]
@@ -249,7 +285,8 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, 
             da, db, dc = dr.abs(dr.dot(a, mid)), dr.abs(dr.dot(b, mid)), dr.abs(dr.dot(c, mid))
             wa, wb, wc = dr.dot(abs_a, half), dr.dot(abs_b, half), dr.dot(abs_c, half)
             near_a, near_b = dr.maximum(da - wa, 0), dr.maximum(db - wb, 0)
-            hit = ~empty & (near_a * near_a + near_b * near_b <= cut2) & (dc - wc <= 1)
+            hit = ~empty & dr.all(dr.abs(mid) <= half + reach)
+            hit &= (near_a * near_a + near_b * near_b <= cut2) & (dc - wc <= 1)
             if dr.hint(whole is not None, mode="scalar"):
                 far_a, far_b = da + wa, db + wb
                 on_rim = far_a * far_a + far_b * far_b > cut2

@@ -8,7 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .history import recorded
 from .needs import emitter_name
+from .pilot import camera_rays
 from .prepared import Prepared
 
 
@@ -116,6 +118,31 @@ def examine(scene: Prepared) -> list[Finding]:
             [spectrum],
         ),
     ]
+
+
+def kernels(scene: Prepared) -> Finding:
+    """What is compiled for each stage, found by a tiny pass with the scene's first sensor."""
+    radius = dr.opaque(mi.Float, scene.settings.initial_radius or 0.01 * scene.extent)
+    rays = camera_rays(scene.scene.sensors()[0], 0)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, dr.width(rays))
+    wavelengths = dr.copy(rays.wavelengths) if mi.is_spectral else None
+    evidence, number, operations = [], 0, 0
+    with recorded() as records:
+
+        def lap(stage: str):
+            nonlocal number, operations
+            unique = {k["hash"]: k for k in records()}.values()
+            size = sum(k["operation_count"] for k in unique)
+            number, operations = number + len(unique), operations + size
+            code = sum(len(k["ir"].getvalue()) for k in unique) / 1024
+            evidence.append(
+                f"{stage}: {len(unique)} kernels, {size:,} operations, {code:,.0f} KiB of code"
+            )
+
+        map_ = scene.with_(photon_count=1024).photon_map(0, 0, 0, wavelengths, lap)
+        scene.radiance(sampler, rays, map_, radius, 0, lap=lap)
+    return Finding("kernels", True, f"{number} kernels, {operations:,} operations", evidence)
 
 
 def _why_map(scene: Prepared) -> list[str]:

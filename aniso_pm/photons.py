@@ -130,15 +130,18 @@ def build_map(
     lap("photons")
     if stored == 0:
         return PhotonMap(photon_count, 0, rejected, None, None, None, None)
-    used = dr.arange(mi.UInt32, stored)
-    position, word = (dr.gather(type(v), v, used) for v in (photons.position, photons.word))
-    index, order = spatial.build(position, word)
-    sorted_flux = dr.empty(mi.Float, stored * _flux_width())
-    dr.scatter(sorted_flux, dr.gather(_packet(), photons.flux, order), used)
+    index, order = spatial.build(_cut(photons, "position", stored), _cut(photons, "word", stored))
+    # What has been put in order is dropped before the next column is.
     direction = None
     if options.general:
-        direction = dr.gather(mi.UInt32, photons.direction, order)
-    dr.eval(sorted_flux, direction)
+        direction = dr.gather(mi.UInt32, _cut(photons, "direction", stored), order)
+        dr.eval(direction)
+    sorted_flux = dr.empty(mi.Float, stored * _flux_width())
+    flux = dr.gather(mi.Spectrum, _cut(photons, "flux", stored), order)
+    dr.scatter(sorted_flux, pack_flux(flux), dr.arange(mi.UInt32, stored))
+    del order, flux
+    dr.eval(sorted_flux)
+    spatial.give_back(stored)
     lap("index")
     return PhotonMap(
         photon_count, stored, rejected, index, sorted_flux, direction, options.wavelengths
@@ -234,6 +237,15 @@ class _Photons:
     direction: Any
 
 
+def _cut(photons, name: str, entries: int):
+    """A column without its spare room, taken out of ``photons``: who gets it has it alone."""
+    column = getattr(photons, name)
+    setattr(photons, name, None)
+    if dr.depth_v(column) == 1:
+        return dr.reshape(type(column), column, entries, shrink=True)
+    return type(column)(*(dr.reshape(type(x), x, entries, shrink=True) for x in column))
+
+
 def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefront):
     """(stored, rejected, _Photons with buffers of at least ``stored`` entries)."""
     while True:
@@ -241,7 +253,7 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefro
         photons = _Photons(
             dr.empty(mi.Point3f, capacity),
             dr.empty(mi.UInt32, capacity),
-            dr.empty(mi.Float, capacity * _flux_width()),
+            dr.empty(mi.Spectrum, capacity),
             dr.empty(mi.UInt32, capacity) if options.general else None,
         )
         stored, rejected = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0)
@@ -259,6 +271,8 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefro
         if count <= capacity:
             return count, int(rejected[0]), photons
         capacity = count
+        del photons
+        spatial.give_back(count)
 
 
 def light_paths(scene, source, sampler, options, photons, stored, rejected, room):
@@ -272,7 +286,7 @@ def light_paths(scene, source, sampler, options, photons, stored, rejected, room
         active = active & (slot < room)
         dr.scatter(photons.position, position, slot, active)
         dr.scatter(photons.word, word, slot, active)
-        dr.scatter(photons.flux, pack_flux(flux), slot, active)
+        dr.scatter(photons.flux, flux, slot, active)
         if options.general:
             dr.scatter(photons.direction, _encode(direction, 16), slot, active)
 

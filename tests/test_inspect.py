@@ -114,3 +114,19 @@ def test_the_command_prints_the_same_as_text_and_json(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "s: SmoothPlastic" in text and "PointLight" in text
     assert cli.main(["inspect", str(tmp_path / "none.xml")]) == 2
+
+
+def test_what_is_left_out_is_not_compiled():
+    def sizes(name, **settings):
+        scene = matrix.make(matrix.rows()[name], size=4)
+        found = inspect.kernels(prepare(scene, Settings(**settings), False))
+        lines = (line.split() for line in found.evidence)
+        return {words[0]: int(words[3].replace(",", "")) for words in lines}
+
+    plain = sizes("area, diffuse")
+    assert list(plain) == ["photons:", "index:", "eye:", "gather:"]
+    assert all(size > 100 for size in plain.values())
+    assert sizes("area, diffuse", kernel="isotropic") == plain
+    assert sizes("area, diffuse", edge_compensation=False)["gather:"] < plain["gather:"]
+    # No map, no photons, and nothing to gather
+    assert list(sizes("area, diffuse", map="caustic")) == ["eye:", "gather:"]

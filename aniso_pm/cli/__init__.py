@@ -16,7 +16,7 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import InputError, is_interrupt, one_line
 
-from . import examine, explain, reference, render, report, scenes
+from . import bench, examine, explain, reference, render, report, scenes
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -84,5 +84,6 @@ for command in (
     explain.explain,
     examine.stability,
     examine.doctor,
+    bench.bench,
 ):
     app.command()(command)

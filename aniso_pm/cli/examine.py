@@ -42,7 +42,8 @@ def inspect(
 
         settings = getattr(integrator, "settings", None) or Settings()
         try:
-            findings = inspection.examine(prepare(world, settings, False))
+            prepared = prepare(world, settings, False)
+            findings = [*inspection.examine(prepared), inspection.kernels(prepared)]
         except ValueError as error:
             raise InputError(one_line(error)) from error
     if as_json:

@@ -1,0 +1,36 @@
+"""Speed and memory, target beside figure (``aniso-pm bench``).
+
+Speeds are ratios within one run wherever that is possible: the machine they were measured on is
+then of little importance. A module of measurements is one idea and has a function
+``measure(quick)`` that yields rows: ``gathering`` and its data (``walls``) and rivals (``grid``),
+``building``, ``tracing``, ``passes``, ``memory``, ``startup``, ``kernels``. ``row`` says what a row
+is and prints it, ``timing`` takes the time, ``rooms`` has the scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import import_module
+
+from .row import Row
+
+# What `aniso-pm bench` calls each group: module.
+GROUPS = {
+    "gather": "gathering",
+    "trace": "tracing",
+    "build": "building",
+    "pass": "passes",
+    "memory": "memory",
+    "startup": "startup",
+    "kernels": "kernels",
+}
+
+
+def measure(groups: list[str], quick: bool) -> Iterator[Row]:
+    """The rows of the named groups, as they are measured. A Mitsuba variant has to be set.
+
+    quick  smaller sizes, fewer repetitions, no slow row: less than a minute for everything, but
+           too small for some of the targets.
+    """
+    for group in groups:
+        yield from import_module(f"{__name__}.{GROUPS[group]}").measure(quick)

@@ -1,0 +1,65 @@
+"""``aniso-pm bench``: speed and memory, target beside figure."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+from aniso_pm.errors import InputError
+
+from .common import Variant, mitsuba_log, set_variant
+
+
+def bench(
+    groups: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[gather|trace|build|pass|memory|startup|kernels|all]...",
+            help="What to measure; everything by default.",
+        ),
+    ] = None,
+    variant: Variant = "llvm_ad_rgb",
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Smaller sizes, nothing slow; less than a minute.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON list.")] = False,
+) -> int:
+    """Measure speed and memory and print each target beside the figure.
+
+    Kernels are compiled before anything is timed, and what is compared is measured in turn. With
+    --json: a list of objects with name, figure (null if it could not be measured), unit, target
+    (such as ">= 0.85"; null where the line informs only), met (true, false or null) and note.
+    Exit status 0 also where a target is missed.
+    """
+    from aniso_pm.bench import GROUPS
+
+    groups = groups or ["all"]
+    for group in groups:
+        if group not in (*GROUPS, "all"):
+            raise InputError(
+                f"there is nothing to measure by the name '{group}'; there are "
+                f"{', '.join(GROUPS)} and all"
+            )
+    wanted = [group for group in GROUPS if group in groups or "all" in groups]
+    set_variant(variant)
+
+    from aniso_pm import output
+    from aniso_pm.bench import measure
+    from aniso_pm.bench.row import HEADER, as_data, line, summary
+
+    if not as_json:
+        print(HEADER)
+    rows = []
+    with mitsuba_log(quiet=False):
+        for row in measure(wanted, quick):
+            rows.append(row)
+            if not as_json:
+                print(line(row), flush=True)
+    if as_json:
+        print(
+            json.dumps(output.plain([as_data(row) for row in rows]), indent=2, ensure_ascii=False)
+        )
+    else:
+        print(summary(rows))
+    return 0

@@ -1,0 +1,160 @@
+"""The benchmark: its rivals count the same photons, its verdicts follow from its figures."""
+
+import json
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from aniso_pm import cli
+from aniso_pm import index as spatial
+from aniso_pm.bench import GROUPS, grid, kernels, memory, rooms, timing, walls
+from aniso_pm.bench.row import Row, as_data, line, summary
+
+
+@pytest.fixture(autouse=True)
+def _variant(variant_llvm_rgb):
+    pass
+
+
+# --- Rows ---
+
+
+def test_a_verdict_follows_from_figure_and_target():
+    assert Row("a", 0.9, "×", (">=", 0.8)).met is True
+    assert Row("a", 0.7, "×", (">=", 0.8)).met is False
+    assert Row("a", 64, "B", ("<=", 64)).met is True
+    assert Row("a", 0.3, "s", ("<", 0.3)).met is False
+    assert Row("a", 0.7, "×").met is None
+    assert Row("a", None, "×", (">=", 0.8)).met is None
+
+
+def test_text_and_data_say_the_same():
+    rows = [Row("gather: a", 0.7123, "×", (">=", 0.85), "note"), Row("b", None, "×", ("<", 1))]
+    assert line(rows[0]).split() == ["missed", "0.7123", "×", ">=", "0.85", "gather:", "a", "note"]
+    assert line(rows[1]).split() == ["-", "-", "×", "<", "1", "b"]
+    assert as_data(rows[0]) == {
+        "name": "gather: a",
+        "figure": 0.7123,
+        "unit": "×",
+        "target": ">= 0.85",
+        "met": False,
+        "note": "note",
+    }
+    assert summary(rows) == "0 of 1 targets met"
+
+
+def test_tasks_take_turns_after_a_round_that_does_not_count():
+    calls = []
+
+    def task(name, seconds):
+        return lambda: calls.append(name) or seconds.pop(0)
+
+    times = timing.interleaved({"a": task("a", [9, 2, 3]), "b": task("b", [8, 1, 5])}, 2)
+    assert calls == ["a", "b"] * 3
+    assert times["a"].seconds == [2, 3] and times["b"].best == 1 and times["b"].median == 3
+
+
+# --- Data ---
+
+
+def test_walls_hold_what_they_promise():
+    rng = np.random.default_rng(0)
+    places = walls.uneven(rng, 20_000, walls.CROWD)
+    on_wall = (places.position[:, None] == np.float32([[0], [1]])).any(1)  # (N, 3)
+    assert (on_wall.any(1)).all()
+    assert np.allclose(np.linalg.norm(places.normal, axis=1), 1)
+    # The normal belongs to an axis along which the point lies on a wall, and points inwards.
+    axis = np.abs(places.normal).argmax(1)
+    at = places.position[np.arange(len(axis)), axis]
+    assert np.array_equal(places.normal[np.arange(len(axis)), axis], 1 - 2 * at)
+    # 99 % ± 4 standard errors in 1 % of the area
+    side = walls.CROWD_AREA**0.5
+    x, y, z = places.position.T
+    inside = (x == 0) & (np.abs(y - 0.5) < side / 2) & (np.abs(z - 0.5) < side / 2)
+    assert np.array_equal(inside, places.crowded)
+    assert inside.mean() == pytest.approx(0.99, abs=0.003)
+    assert walls.CROWD_AREA / walls.WALLS == pytest.approx(0.01)
+
+
+def brute_force(places, e):
+    """Number of points inside each ellipse, all pairs in double precision."""
+    center, a, b, c = (np.array(v).T.astype(np.float64) for v in (e.center, e.a, e.b, e.c))
+    d = places.position[None].astype(np.float64) - center[:, None]
+    rho2 = np.einsum("qpk,qk->qp", d, a) ** 2 + np.einsum("qpk,qk->qp", d, b) ** 2
+    flat = np.abs(np.einsum("qpk,qk->qp", d, c))
+    return ((rho2 <= walls.CUT2) & (flat <= 1)).sum(1), np.exp(-rho2) * (rho2 <= walls.CUT2) * (
+        flat <= 1
+    )
+
+
+@pytest.mark.parametrize("crowd", [False, True])
+def test_grid_and_index_find_what_brute_force_finds(crowd):
+    rng = np.random.default_rng(3)
+    n, queries = 20_000, 400
+    if crowd:
+        inside, outside = walls.uneven_radii(n)
+        places = walls.uneven(rng, n, walls.CROWD)
+        at = walls.uneven(rng, queries, 0.5, outside)
+        radius = np.where(at.crowded, inside, outside)
+    else:
+        places, at = walls.even(rng, n), walls.even(rng, queries)
+        radius = np.full(queries, walls.even_radius(n))
+    e = walls.ellipses(rng, at, radius, 1)
+    points, word = places.points(), dr.zeros(mi.UInt32, n)
+    visit, zero = walls.visitor(dr.full(mi.Float, 1, 4 * n))
+    index, _ = spatial.build(points, word)
+    cells = grid.build(points, word, float(radius.max()))
+    found = {
+        "index": spatial.gather(index, e, walls.CUT2, visit, zero, mi.Bool(True)),
+        "grid": grid.gather(cells, e, walls.CUT2, visit, zero, False),
+        "rows": grid.gather(cells, e, walls.CUT2, visit, zero, True),
+    }
+    expected, weight = brute_force(places, e)
+    # Kernels at edges hold fewer or, from two walls, more.
+    assert expected.mean() == pytest.approx(walls.PER_QUERY, rel=0.2)
+    for name, (power, count) in found.items():
+        # A photon within rounding of the rim may go either way.
+        assert np.abs(count.numpy().astype(int) - expected).sum() <= 3, name
+        assert np.allclose(power.x.numpy(), weight.sum(1), rtol=1e-3, atol=0.1), name
+    assert not dr.any(zero[0].x != 0)  # sums must not leak into the next one
+
+
+# --- What is measured ---
+
+
+def test_a_plain_room_compiles_the_same_kernels_for_both_kernel_types():
+    plain = mi.load_dict(rooms.room(8))
+    assert kernels.hashes(plain, "anisotropic") == kernels.hashes(plain, "isotropic")
+    metal = mi.load_dict(rooms.brushed_back(8))
+    assert kernels.hashes(metal, "anisotropic") != kernels.hashes(metal, "isotropic")
+
+
+def test_a_map_takes_at_most_64_bytes_a_photon_at_its_peak():
+    found = memory.in_process("map_memory", 400_000)
+    assert found["stored"] > 1_000_000
+    # The measurement is not blind: at rest the map is there.
+    assert found["at_rest"] * 0.9 <= found["resident"] / found["stored"] <= 64
+
+
+def test_unknown_groups_are_named(capsys):
+    assert cli.main(["bench", "speed"]) == 2
+    message = capsys.readouterr().err
+    assert "'speed'" in message and all(group in message for group in GROUPS)
+    assert message.count("\n") == 1
+
+
+def test_bench_prints_json(capsys):
+    assert cli.main(["bench", "startup", "kernels", "--quick", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert {"name", "figure", "unit", "target", "met", "note"} == set(rows[0])
+    assert [row["name"].split(":")[0] for row in rows] == ["startup"] * 3 + ["kernels"] * 2
+    assert rows[3]["target"] == "<= 0" and rows[3]["met"] is True
+
+
+@pytest.mark.slow
+def test_the_whole_benchmark_runs_quickly(capsys):
+    assert cli.main(["bench", "--quick", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert {row["name"].split(":")[0] for row in rows} == set(GROUPS)
+    assert all(row["figure"] is not None for row in rows)
