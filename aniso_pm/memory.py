@@ -31,7 +31,7 @@ _SHARE = 0.75
 # --- Bytes, measured (see above) ---
 _FIXED = 32 << 20  # compiled kernels
 _LIGHT_PATH = 24  # in flight: random numbers, emitter sample
-_PHOTON = 140  # while the index is built: buffers, sorted copies, keys (16 of them flux)
+_PHOTON = 62  # while the index is built: buffers, sorted copies, keys (32 of them flux)
 _PHOTON_SUMMED = 22  # with gather_tolerance: its share of the sums over nodes
 _EYE_SAMPLE = 70  # in flight: ray, random numbers, radiance
 _POINT = 100  # gather point: columns, sorted copies, result (12 of them throughput)
