@@ -31,7 +31,7 @@ _SHARE = 0.75
 # --- Bytes, measured (see above) ---
 _FIXED = 32 << 20  # compiled kernels
 _LIGHT_PATH = 24  # in flight: random numbers, emitter sample
-_PHOTON = 62  # while the index is built: buffers, sorted copies, keys (32 of them flux)
+_PHOTON = 62  # while the index is built: buffers, sorted copies, keys (16 of them flux)
 _PHOTON_SUMMED = 22  # with gather_tolerance: its share of the sums over nodes
 _EYE_SAMPLE = 70  # in flight: ray, random numbers, radiance
 _POINT = 100  # gather point: columns, sorted copies, result (12 of them throughput)
@@ -74,7 +74,7 @@ class Plan:
         scene, job = self.scene, self.job
         flux, general = photons.flux_bytes(), bool(scene.needs.general)
         summed = scene.settings.gather_tolerance > 0
-        per_photon = _PHOTON + 2 * (flux - 16) + general * 8 + summed * _PHOTON_SUMMED
+        per_photon = _PHOTON + (flux - 16) + general * 8 + summed * _PHOTON_SUMMED
         per_point = _POINT + scene.follow_lobes * _POINT_LOBE + general * _POINT_GENERAL
         per_sample = _EYE_SAMPLE + _points_per_sample(scene) * (per_point + 2 * (flux - 16))
         paths = min(self.light_paths, scene.settings.photon_count) if scene.needs_map else 0
