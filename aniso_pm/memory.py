@@ -101,7 +101,7 @@ def _points_per_sample(scene: Prepared) -> float:
     if not scene.needs_map:
         return 0
     if scene.use == "caustic":
-        return 4.5
+        return 6  # 4 and buffers that grew
     return 2 if scene.use == "final_gather" else 1 + 0.2 * bool(scene.needs.general)
 
 
