@@ -9,8 +9,15 @@ The mathematics is usable by itself: :mod:`aniso_pm.asg` (anisotropic spherical 
 :mod:`aniso_pm.kernel` (elliptical kernels).
 """
 
+from pathlib import Path
+
 from aniso_pm import _llvm
 from aniso_pm._version import __version__
+
+# In a clone plugins/ and scenes/ lie beside this folder. Python started there finds this folder
+# before the installed package, which has them inside.
+if not (Path(__file__).parent / "plugins").is_dir():
+    __path__.append(str(Path(__file__).parent.parent))
 
 _llvm.prepare()
 

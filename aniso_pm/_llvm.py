@@ -24,7 +24,7 @@ PACKAGE = "karellen-llvm-core"
 
 def find_library() -> Path | None:
     """The newest usable libLLVM that the ``karellen-llvm-core`` package installed, or None."""
-    usable = {}
+    usable: dict[tuple[int, int], Path] = {}
     for path in _candidates():
         # Links carry no version ("libLLVM.so"); the files they lead to do ("libLLVM.so.23.1").
         path = path.resolve()
@@ -43,8 +43,8 @@ def _candidates():
     else:
         for file in package.files or ():
             if file.name.startswith("libLLVM"):
-                yield Path(package.locate_file(file))
-        folders = [Path(package.locate_file("lib"))]  # where `pip install --target` puts it
+                yield Path(str(package.locate_file(file)))
+        folders = [Path(str(package.locate_file("lib")))]  # where `pip install --target` puts it
 
     folders += [Path(sys.prefix) / "lib", Path(site.getuserbase()) / "lib"]
     for folder in folders:

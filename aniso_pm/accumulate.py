@@ -67,7 +67,8 @@ class Sums:
     @staticmethod
     def from_arrays(arrays: dict[str, np.ndarray]) -> Sums:
         """Inverse of :meth:`arrays`."""
-        shape = tuple(int(n) for n in arrays["first"].shape)
+        height, width, channels = map(int, arrays["first"].shape)
+        shape = height, width, channels
         return Sums(shape, *(mi.Float64(arrays[k].ravel()) for k in ("first", "square", "cross")))
 
 

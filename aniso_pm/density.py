@@ -26,6 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import index as spatial
+from . import summed
 from .eye import GatherPoints
 from .kernel import PlaneKernel, disc, guarded_axes
 from .photons import (
@@ -120,6 +121,7 @@ def estimate(
     max_depth,
     active,
     surface=None,
+    tolerance: float = 0,
 ):
     """(reflected radiance, photons inside the kernel) of each gather point, edges not yet
     compensated.
@@ -127,18 +129,14 @@ def estimate(
     max_depth  path segments of camera and light path together, or 0 for no limit (or none that
                the map does not already keep).
     surface    Surface of receivers that are not Lambertian.
+    tolerance  of the sum, relative to the flux in the kernel, if the map has sums; see ``summed``.
     """
     ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
-    n = mi.Vector3f(points.n)
-    allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
+    counts = _filter(points, max_depth)
 
     def visit(total, slot, word, rho2, inside):
         reflected, missing, count = total
-        inside &= faces(word, n)
-        if max_depth:
-            inside &= segments(word) <= allowed
-        if points.caustic is not None:
-            inside &= is_caustic(word) | ~points.caustic
+        inside &= counts(word)
         light = photon_flux(photons, slot, inside) * dr.select(inside, dr.exp(-rho2), 0)
         if surface is not None:
             light *= surface.brdf(photon_direction(photons, slot, inside), inside)
@@ -148,10 +146,60 @@ def estimate(
         sum_ = reflected + term
         return sum_, (sum_ - reflected) - term, count + dr.select(inside, mi.UInt32(1), 0)
 
+    def visit_node(total, node):
+        reflected, missing, count = total
+        light, inside, taken = summed.weighed(photons.sums, node, ellipses, CUT2, counts, tolerance)
+        term = light - missing
+        sum_ = reflected + term
+        return (
+            (sum_, (sum_ - reflected) - term, count + photons.index.points_in(node, inside)),
+            taken,
+        )
+
+    # Where photons bring directions, a sum over them says nothing.
+    whole = None
+    if photons.sums is not None and surface is None:
+        whole = 0.5 * tolerance, math.exp(-CUT2), visit_node
     total = (mi.Spectrum(0), mi.Spectrum(0), mi.UInt32(0))
-    reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active)
+    reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active, whole)
     area = dr.pi * dr.sqrt(dr.squared_norm(kernel.s)) * dr.sqrt(dr.squared_norm(kernel.t))
     return points.weight * reflected / (area * (KERNEL_MASS * photons.emitted)), count
+
+
+def _filter(points: GatherPoints, max_depth):
+    """A function of a photon's word: does the photon count at these gather points, if it is inside
+    the kernel and the cosine of normals is above ``least``?"""
+    n = mi.Vector3f(points.n)
+    allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
+
+    def counts(word, least=NORMAL_COS):
+        yes = faces(word, n, least)
+        if max_depth:
+            yes &= segments(word) <= allowed
+        if points.caustic is not None:
+            yes &= is_caustic(word) | ~points.caustic
+        return yes
+
+    return counts
+
+
+def photons_inside(
+    photons: PhotonMap, points: GatherPoints, kernel: PlaneKernel, radius, max_depth
+):
+    """Is the photon in each slot of the map one that :func:`estimate` sums up?  (one gather point)
+
+    Returns mi.Bool, as wide as there are photons.
+    """
+    ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
+    counts = _filter(points, max_depth)
+    found = dr.zeros(mi.Bool, photons.stored)
+
+    def visit(total, slot, word, rho2, inside):
+        dr.scatter(found, mi.Bool(True), slot, inside & counts(word))
+        return total
+
+    spatial.gather(photons.index, ellipses, CUT2, visit, mi.UInt32(0), mi.Bool(True))
+    return found
 
 
 @dataclass(frozen=True)

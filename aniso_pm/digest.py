@@ -54,14 +54,16 @@ def camera_entries(sensor) -> dict[str, Any]:
 
 def identity(prepared, sensor, seed: int, samples_per_pass: str) -> dict[str, Any]:
     """Everything that a pass depends on but its number. The entries "initial radius" and "photon
-    count", which may be chosen automatically, are filled in by the renderer."""
-    stopping = ("passes", "time", "target_error", "initial_radius", "photon_count")
+    count", which may be chosen automatically, are filled in by the renderer. ``max_memory`` is left
+    out: smaller wavefronts draw other random numbers, but passes remain independent of each other,
+    so that machines of any size may add to one picture."""
+    elsewhere = ("passes", "time", "target_error", "initial_radius", "photon_count", "max_memory")
     parameters = {
         f'parameter "{name}"': value
         for name, value in (
             asdict(prepared.settings) | {"hide_emitters": prepared.hide_emitters}
         ).items()
-        if name not in stopping
+        if name not in elsewhere
     }
     return {
         "version of aniso_pm": __version__,
@@ -94,7 +96,7 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
 
 def _hash(thing) -> str:
     text = re.sub(r"(sample_count|samples_per_wavefront|wavefront_size) = \d+", "", str(thing))
-    pieces = [text]
+    pieces: list[str | bytes] = [text]
     parameters = mi.traverse(thing)
     for index, key in enumerate(parameters.keys()):
         value = parameters[key]

@@ -47,14 +47,15 @@ def _without_traceback(text: str) -> str:
 def _root(error: BaseException) -> str:
     # Dr.Jit wraps what goes wrong in a kernel in "…error while performing… (see above)".
     while error.__cause__ is not None and "see above" in str(error):
-        error = error.__cause__ or error.__context__
+        error = error.__cause__
     return str(error)
 
 
 def is_interrupt(error: BaseException) -> bool:
     """Whether ``error`` is Ctrl-C, itself or below what was raised because of it."""
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
+    below: BaseException | None = error
+    while below is not None:
+        if isinstance(below, KeyboardInterrupt):
             return True
-        error = error.__cause__ or error.__context__
+        below = below.__cause__ or below.__context__
     return False

@@ -38,6 +38,7 @@ class WalkOptions:
     min_segments   segments of the shortest light path that the map holds (2; 1 where the scene has
                    direct light that only the map knows).
     hide_emitters  directly visible emitters are invisible.
+    gathers        there is a map to be read; without it no gather point is left.
     follow_lobes   keep the anisotropic lobe of the last glossy vertex (``needs.lobes``).
     deep           the scene has surfaces to walk on (``needs.chains``).
     general        the scene has receivers that are not Lambertian (``needs.general``).
@@ -49,6 +50,7 @@ class WalkOptions:
     rr_depth: int
     min_segments: int
     hide_emitters: bool
+    gathers: bool
     follow_lobes: bool
     deep: bool
     general: bool
@@ -81,13 +83,14 @@ class GatherPoints:
     caustic: Any
 
 
-def map_tree(function, *trees):
+def map_tree(function, *trees: Any) -> Any:
     """Apply a function to the Dr.Jit arrays of equal trees of dataclasses (None stays None)."""
     first = trees[0]
     if first is None:
         return None
     if is_dataclass(first):
-        return type(first)(
+        kind: Any = type(first)
+        return kind(
             **{
                 f.name: map_tree(function, *(getattr(t, f.name) for t in trees))
                 for f in fields(first)
@@ -111,6 +114,10 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     expected  gather points to make room for; with too few the same paths are traced again.
     launch    ``eye_paths``, or that function frozen.
     """
+    if not options.gathers:
+        L, valid, _, _ = (launch or eye_paths)(scene, sampler, ray, options, None, None, None)
+        dr.eval(L, valid)
+        return L, valid, None
     # Without mixed receivers a path ends where it leaves its first gather point.
     single = options.use == "global" and not options.general
     capacity = dr.width(ray) if single else max(2 * dr.width(ray), expected + expected // 8)
@@ -132,9 +139,9 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     return L, valid, take(points, curve_order(position))
 
 
-def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room):
+def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room, see=None):
     """One wavefront of eye paths, gather points into their columns: (radiance, valid, rows used,
-    columns)."""
+    columns). see: called as see(lane, depth, si, bsdf, bs, active) where paths scatter."""
 
     def push(point, active):
         slot = dr.scatter_inc(rows, mi.UInt32(0), active)
@@ -146,7 +153,7 @@ def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room):
 
         map_tree(put, points, point)
 
-    L, valid = _walk(scene, sampler, ray, options, push)
+    L, valid = _walk(scene, sampler, ray, options, push, see)
     return L, valid, rows, points
 
 
@@ -177,7 +184,7 @@ def _blank(o: WalkOptions) -> GatherPoints:
 
 
 @dr.syntax
-def _walk(scene, sampler, ray, options, push):
+def _walk(scene, sampler, ray, options, push, see):
     ctx = mi.BSDFContext()
     o = options
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
@@ -239,11 +246,15 @@ def _walk(scene, sampler, ray, options, push):
         L[here & ~finite] = dr.nan  # counted and dropped later
         if dr.hint(o.follow_lobes, mode="scalar"):
             path.distance += dr.select(active, si.t, 0)
-        push(_point(o, lane, si, ray, weight, depth, path, lambertian, scattered), here & finite)
+        if dr.hint(o.gathers, mode="scalar"):
+            point = _point(o, lane, si, ray, weight, depth, path, lambertian, scattered)
+            push(point, here & finite)
 
         # --- Sample the BSDF ---
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        if dr.hint(see is not None, mode="scalar"):
+            see(lane, depth, si, bsdf, bs, active)
         # Share of the gathered part in the sampled direction
         g = dr.select(is_receiver, mi.Spectrum(1), mi.Spectrum(0))
         if dr.hint(o.general, mode="scalar"):

@@ -15,18 +15,28 @@ def pixel_count(film) -> int:
     return width * height
 
 
-def sample_rays(sensor, sampler, spp, wavelength):
+def sample_rays(sensor, sampler, spp, wavelength, first, pixels):
     """Camera rays of one wavefront: (ray, weight, position on the film), spp samples a pixel in
-    consecutive lanes. wavelength: the sample in [0, 1) that chooses wavelengths for all of them."""
+    consecutive lanes. first, pixels: which of them, row by row. wavelength: the
+    sample in [0, 1) that chooses wavelengths for all of them."""
     film = sensor.film()
-    width, height = _sampled_size(film)
-    lane = dr.arange(mi.UInt32, width * height * spp)
-    pixel = lane // dr.opaque(mi.UInt32, spp)
+    width, _ = _sampled_size(film)
+    lane = dr.arange(mi.UInt32, pixels * spp)
+    pixel = lane // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first)
     row = pixel // width
     corner = mi.Point2i(mi.Int32(pixel - row * width), mi.Int32(row)) - _border(film)
     corner += mi.Point2i(mi.ScalarPoint2i(film.crop_offset()))
 
     position = mi.Point2f(corner) + sampler.next_2d()
+    ray, weight = rays_through(sensor, sampler, position, wavelength)
+    # With a box filter the offset within the pixel only adds rounding errors at pixel borders.
+    splat_at = mi.Point2f(corner) if film.rfilter().is_box_filter() else position
+    return ray, weight, splat_at
+
+
+def rays_through(sensor, sampler, position, wavelength):
+    """Camera rays through positions on the film (pixels): (ray, weight)."""
+    film = sensor.film()
     scale = mi.ScalarVector2f(1 / film.crop_size().x, 1 / film.crop_size().y)
     normalised = (position - mi.ScalarPoint2f(film.crop_offset())) * scale
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
@@ -34,10 +44,7 @@ def sample_rays(sensor, sampler, spp, wavelength):
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     u = dr.opaque(mi.Float, wavelength)
-    ray, weight = sensor.sample_ray(time, u, normalised, aperture)
-    # With a box filter the offset within the pixel only adds rounding errors at pixel borders.
-    splat_at = mi.Point2f(corner) if film.rfilter().is_box_filter() else position
-    return ray, weight, splat_at
+    return sensor.sample_ray(time, u, normalised, aperture)
 
 
 def wavelengths(sensor, u):

@@ -9,8 +9,8 @@ bytes, one load, a few per cent too large. The traversal needs no stack: a node 
 out (1 means: finished).
 
 A neighbourhood is an elliptical cylinder {d : (a·d)² + (b·d)² <= cut², |c·d| <= 1} around a
-centre. Its test against a box costs the same at any aspect ratio, so a thin ellipse visits the
-points along it, not those of a disc around it.
+centre. It meets a box if their projections meet on its own axes and on those of the box. That costs
+the same at any aspect ratio: a thin ellipse visits the points along it, not those of a disc.
 
 This module knows points and ellipses; what the points carry is the caller's.
 """
@@ -45,6 +45,11 @@ class Ellipses:
     b: Any
     c: Any
 
+    def reach(self, cut2: float):
+        """Half extents along x, y and z, a little more than exact; a, b and c are orthogonal."""
+        s, t, n = (v * dr.rcp(dr.squared_norm(v)) for v in (self.a, self.b, self.c))
+        return (1 + 1e-5) * (dr.sqrt(cut2 * (s * s + t * t)) + dr.abs(n))
+
     @staticmethod
     def from_axes(center, s, t, n, half_thickness) -> Ellipses:
         """Half axes s ⟂ t (where the weight is 1/e) in the plane of unit normal n."""
@@ -71,6 +76,14 @@ class Index:
     points: Any
     boxes: Any
     extent: Any
+
+    def points_in(self, node, active):
+        """Number of points below a node; 0 where it is not active."""
+        n_leaves, count = dr.opaque(mi.UInt32, self.n_leaves), dr.opaque(mi.UInt32, self.count)
+        height = dr.lzcnt(node) - dr.lzcnt(n_leaves)
+        first = LEAF * ((node << height) - n_leaves)
+        number = dr.minimum(LEAF << height, count - first)
+        return dr.select(active, number, 0)
 
 
 def curve_order(positions):
@@ -233,12 +246,17 @@ def _spread(x):
 
 
 @dr.syntax
-def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active):
+def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, whole=None):
     """Fold ``visit`` over all points inside each lane's ellipse.
 
     visit(total, slot, word, rho2, inside) -> total is called with the slot of a point, its word,
     ρ² = (a·d)² + (b·d)² and whether it is inside (it is not in slots without a point); ``total`` is
     any tree of Dr.Jit arrays.
+
+    whole  None, or (tolerance, rim, visit_node): nodes within the thickness of the cylinder whose
+           half extents x, y in units of 1/|a|, 1/|b| have x² + y² <= tolerance (x² + y² + rim, if
+           the rim goes through them) are offered to visit_node(total, node) -> (total, taken), and
+           only opened if they are not taken.
 
     Lanes that lie next to each other should have ellipses next to each other (``curve_order``):
     they go through the same nodes at the same time then, twice as fast.
@@ -250,8 +268,10 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active):
     center, a, b, c = ellipses.center, ellipses.a, ellipses.b, ellipses.c
     n_leaves = dr.opaque(mi.UInt32, index.n_leaves)
     points, boxes = index.points, index.boxes
-    half_extent = 0.5 * index.extent
+    half_extent, reach = 0.5 * index.extent, mi.Vector3f(ellipses.reach(cut2))
     abs_a, abs_b, abs_c = dr.abs(a), dr.abs(b), dr.abs(c)
+    if dr.hint(whole is not None, mode="scalar"):
+        tolerance, rim, visit_node = dr.opaque(mi.Float, whole[0]), whole[1], whole[2]
 
     queue = dr.alloc_local(mi.UInt32, _QUEUE + 1)
     node = dr.select(active, mi.UInt32(1), mi.UInt32(0))  # 0: finished
@@ -262,10 +282,20 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active):
             half = size * half_extent
             # Relative to the centre first: far from the origin a box's middle is not a number.
             mid = (low - center) + half
-            da = dr.maximum(dr.abs(dr.dot(a, mid)) - dr.dot(abs_a, half), 0)
-            db = dr.maximum(dr.abs(dr.dot(b, mid)) - dr.dot(abs_b, half), 0)
-            dc = dr.abs(dr.dot(c, mid)) - dr.dot(abs_c, half)
-            hit = ~empty & (da * da + db * db <= cut2) & (dc <= 1)
+            da, db, dc = dr.abs(dr.dot(a, mid)), dr.abs(dr.dot(b, mid)), dr.abs(dr.dot(c, mid))
+            wa, wb, wc = dr.dot(abs_a, half), dr.dot(abs_b, half), dr.dot(abs_c, half)
+            near_a, near_b = dr.maximum(da - wa, 0), dr.maximum(db - wb, 0)
+            hit = ~empty & dr.all(dr.abs(mid) <= half + reach)
+            hit &= (near_a * near_a + near_b * near_b <= cut2) & (dc - wc <= 1)
+            if dr.hint(whole is not None, mode="scalar"):
+                far_a, far_b = da + wa, db + wb
+                on_rim = far_a * far_a + far_b * far_b > cut2
+                error = wa * wa + wb * wb + dr.select(on_rim, rim, 0)
+                small = hit & (error <= tolerance) & (dc + wc <= 1)
+                taken = mi.Bool(False)
+                if small:
+                    total, taken = visit_node(total, node)
+                hit &= ~taken
             is_leaf = node >= n_leaves
             # Not a masked write: those go astray in Dr.Jit 1.5's LLVM backend.
             queue[dr.select(hit & is_leaf, found, _QUEUE)] = node - n_leaves

@@ -39,7 +39,7 @@ def examine(scene: Prepared) -> list[Finding]:
             f"{scene.use}: photons are traced and gathered"
             if scene.needs_map
             else "no photon is traced: the scene is path traced",
-            needs.receivers or ["no surface gathers"],
+            _why_map(scene) + (needs.receivers or ["no surface gathers"]),
         ),
         Finding(
             "caustics, specular chains",
@@ -60,6 +60,14 @@ def examine(scene: Prepared) -> list[Finding]:
             bool(needs.unreadable),
             "kernels behind these surfaces are discs" if needs.unreadable else "none",
             needs.unreadable,
+        ),
+        Finding(
+            "grooves without direction",
+            bool(needs.grainless),
+            "anisotropic meshes need texture coordinates; these have none"
+            if needs.grainless
+            else "none",
+            needs.grainless,
         ),
         Finding(
             "general receivers",
@@ -88,6 +96,14 @@ def examine(scene: Prepared) -> list[Finding]:
             if scene.gather_depth
             else "not tested: no limit, or the map keeps it",
             [f"max_depth={settings.max_depth}"],
+        ),
+        Finding(
+            "sums over nodes",
+            settings.gather_tolerance > 0 and scene.needs_map,
+            "groups of photons inside a kernel count as one"
+            if settings.gather_tolerance
+            else "not built: every photon is summed",
+            [f"gather_tolerance={settings.gather_tolerance:g}"],
         ),
         Finding(
             "edge compensation",
@@ -127,6 +143,15 @@ def kernels(scene: Prepared) -> Finding:
         map_ = scene.with_(photon_count=1024).photon_map(0, 0, 0, wavelengths, lap)
         scene.radiance(sampler, rays, map_, radius, 0, lap=lap)
     return Finding("kernels", True, f"{number} kernels, {operations:,} operations", evidence)
+
+
+def _why_map(scene: Prepared) -> list[str]:
+    """What ``map=auto`` went by."""
+    if scene.settings.map != "auto":
+        return []
+    needs = scene.needs
+    cause = [f"light over {e}" for e in needs.chains] + [f"light of {e}" for e in needs.unseen]
+    return [f"map=auto: {cause[0] if cause else 'nothing casts caustics'}"]
 
 
 def as_text(findings: list[Finding]) -> str:

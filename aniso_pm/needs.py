@@ -23,6 +23,7 @@ class Needs:
     bent       surfaces with bump or normal maps.
     unreadable glossy surfaces whose roughness cannot be read: kernels behind them are discs.
     unseen     emitters whose direct light only photons can find.
+    grainless  meshes without texture coordinates that have an anisotropic BSDF.
     """
 
     lobes: list[str] = field(default_factory=list)
@@ -32,6 +33,7 @@ class Needs:
     bent: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
+    grainless: list[str] = field(default_factory=list)
 
 
 def read_scene(scene, gather_roughness: float) -> Needs:
@@ -65,10 +67,15 @@ def read_scene(scene, gather_roughness: float) -> Needs:
             _refuse_unlit(needs, f"{name}: Instance")
             continue
         bsdf = shape.bsdf()
-        if bsdf is None or bsdf.ptr in seen:
+        if bsdf is None:
+            continue
+        if isinstance(shape, mi.Mesh) and not shape.has_vertex_texcoords():
+            if _may_be_anisotropic(bsdf):
+                needs.grainless.append(f"{name}: {describe(bsdf)}")
+        if bsdf.ptr in seen:
             continue
         seen.add(bsdf.ptr)
-        evidence = f"{name}: {_describe(bsdf)}"
+        evidence = f"{name}: {describe(bsdf)}"
         if may_gather(bsdf, gather_roughness):
             needs.receivers.append(evidence)
         if is_lambertian(bsdf):
@@ -110,12 +117,12 @@ def emitter_name(emitter) -> str:
     return f"{emitter.id()}: {emitter.class_name()}".removeprefix(": ")
 
 
-def _describe(bsdf) -> str:
+def describe(bsdf) -> str:
     """Class names of a tree of BSDFs: TwoSidedBRDF(RoughConductor)."""
     python = type(bsdf).__module__.split(".")[0] != "mitsuba"
     name = type(bsdf).__name__ if python else bsdf.class_name()
     distinct = {child.ptr: child for child in nested_bsdfs(children(bsdf))}  # twosided: twice one
-    nested = ", ".join(_describe(child) for child in distinct.values())
+    nested = ", ".join(describe(child) for child in distinct.values())
     return f"{name}({nested})" if nested else name
 
 

@@ -78,6 +78,7 @@ class PhotonMap:
     flux       W, interleaved channels, padded to a power of two.
     direction  where the light came from, 32 bits octahedral; None where no receiver needs it.
     wavelengths  nm, in spectral variants; the flux is W/nm then.
+    sums       summed.Sums of the index's nodes, or None.
     """
 
     emitted: int
@@ -87,6 +88,7 @@ class PhotonMap:
     flux: Any
     direction: Any
     wavelengths: Any
+    sums: Any = None
 
 
 EMPTY = PhotonMap(0, 0, 0, None, None, None, None)
@@ -105,16 +107,25 @@ def build_map(
     expected: int = 0,
     launch=None,
     lap=lambda stage: None,
+    wavefront: int | None = None,
 ):
     """Trace ``photon_count`` light paths from ``source`` and index what they leave.
 
     expected  photons to make room for; with too little room the same paths are traced again.
     launch    ``light_paths``, or that function frozen.
     lap       called with the name of each stage that ends.
+    wavefront  light paths traced at once; None: WAVEFRONT.
     """
     room = max(expected, int(_FIRST_GUESS * photon_count))
     stored, rejected, photons = _trace(
-        scene, source, photon_count, seed, options, room, launch or light_paths
+        scene,
+        source,
+        photon_count,
+        seed,
+        options,
+        room,
+        launch or light_paths,
+        wavefront or WAVEFRONT,
     )
     lap("photons")
     if stored == 0:
@@ -127,7 +138,7 @@ def build_map(
         dr.eval(direction)
     sorted_flux = dr.empty(mi.Float, stored * _flux_width())
     flux = dr.gather(mi.Spectrum, _cut(photons, "flux", stored), order)
-    dr.scatter(sorted_flux, _pack(flux), dr.arange(mi.UInt32, stored))
+    dr.scatter(sorted_flux, pack_flux(flux), dr.arange(mi.UInt32, stored))
     del order, flux
     dr.eval(sorted_flux)
     spatial.give_back(stored)
@@ -139,7 +150,12 @@ def build_map(
 
 def photon_flux(photons: PhotonMap, slot, active):
     """Flux (mi.Spectrum, W) of the photon in a slot."""
-    packed = dr.gather(_packet(), photons.flux, slot, active)
+    return read_flux(photons.flux, slot, active)
+
+
+def read_flux(column, slot, active):
+    """An entry of a column of fluxes that ``pack_flux`` has made."""
+    packed = dr.gather(_packet(), column, slot, active)
     return mi.Spectrum(*(packed[k] for k in range(dr.size_v(mi.Spectrum))))
 
 
@@ -167,11 +183,16 @@ def encode_normal(n):
     return _encode(n, 12)
 
 
-def faces(word, n):
-    """Is the photon's normal within 41 degrees of n (cosine above NORMAL_COS)?"""
+def decode_normal(word):
+    """Inverse of ``encode_normal``; higher bits of the word are ignored."""
+    return _decode(word, 12)
+
+
+def faces(word, n, least=NORMAL_COS):
+    """Is the cosine between the photon's normal and n above ``least`` (> 0)?"""
     v = _octahedral(word, 12)
     cosine = dr.dot(v, n)
-    return (cosine > 0) & (dr.square(cosine) > NORMAL_COS**2 * dr.squared_norm(v))
+    return (cosine > 0) & (dr.square(cosine) > least**2 * dr.squared_norm(v))
 
 
 def _encode(v, bits):
@@ -225,7 +246,7 @@ def _cut(photons, name: str, entries: int):
     return type(column)(*(dr.reshape(type(x), x, entries, shrink=True) for x in column))
 
 
-def _trace(scene, source, photon_count, seed, options, capacity, launch):
+def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefront):
     """(stored, rejected, _Photons with buffers of at least ``stored`` entries)."""
     while True:
         capacity = max(capacity + capacity // 16, 1024)
@@ -237,10 +258,10 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch):
         )
         stored, rejected = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0)
         room = dr.opaque(mi.UInt32, capacity)
-        for first in range(0, photon_count, WAVEFRONT):
+        for first in range(0, photon_count, wavefront):
             sampler = mi.load_dict({"type": "independent"})
             sampler.seed(
-                mi.sample_tea_32(seed, first // WAVEFRONT)[0], min(WAVEFRONT, photon_count - first)
+                mi.sample_tea_32(seed, first // wavefront)[0], min(wavefront, photon_count - first)
             )
             photons, stored, rejected = launch(
                 scene, source, sampler, options, photons, stored, rejected, room
@@ -406,6 +427,7 @@ def _bent_bounce(ctx, bsdf, si, bs, weight, sampler, active):
     return bs, dr.select(delta, 2 * weight * cosines, value)
 
 
-def _pack(spectrum):
+def pack_flux(spectrum):
+    """A flux as it is stored, padded."""
     channels = [spectrum[k] for k in range(dr.size_v(mi.Spectrum))]
     return _packet()(*(channels + [mi.Float(0)] * (_flux_width() - len(channels))))

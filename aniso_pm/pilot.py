@@ -24,7 +24,7 @@ FEWEST, MOST = 10_000, 5_000_000
 # Light paths and eye paths of the pilot, and photons that a disc must hold to be measured.
 _PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
 # Range of radii as shares of the scene's extent: 1e-5 · √2^27 = 0.1.
-_SMALLEST, _LARGEST, _STEPS = 1e-5, 0.1, 27
+_SMALLEST, LARGEST, _STEPS = 1e-5, 0.1, 27
 
 
 def camera_rays(sensor, seed: int):
@@ -38,12 +38,30 @@ def camera_rays(sensor, seed: int):
     return ray
 
 
+def settle(scene: Prepared, sensor, seed: int, samples: int, count=None, radius=None):
+    """(light paths per pass, bandwidth of the first pass): what is not given is chosen.
+
+    samples: eye samples of a pass.
+    """
+    if not count or not radius:
+        rays = camera_rays(sensor, seed)
+        count = count or automatic_photon_count(scene, rays, seed, samples)
+        radius = radius or automatic_radius(scene.with_(photon_count=count), rays, seed)
+    return count, radius
+
+
 def _weighted_median(radii) -> float:
     """Median with weights 1/r² (proportional to the density of photons, hence to the light that
     the point receives): half of the light is estimated at smaller radii, half at larger ones."""
     radii = np.sort(radii)
     light = np.cumsum(radii.astype(np.float64) ** -2)
     return float(radii[np.searchsorted(light, 0.5 * light[-1])])
+
+
+def photons_per_path(scene: Prepared, seed: int) -> float:
+    """Photons that a light path leaves in the mean."""
+    map_ = scene.with_(photon_count=_PATHS).photon_map(stream_seed(seed, PILOT), 0)
+    return map_.stored / max(map_.emitted, 1)
 
 
 def automatic_radius(scene: Prepared, rays, seed: int) -> float:
@@ -80,7 +98,7 @@ def automatic_radius(scene: Prepared, rays, seed: int) -> float:
             break
     median = _weighted_median(radius.numpy())
     more_photons = scene.settings.photon_count / pilot.settings.photon_count
-    return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), _LARGEST * extent)
+    return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), LARGEST * extent)
 
 
 def automatic_photon_count(scene: Prepared, rays, seed: int, eye_samples: int) -> int:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from . import density, emission, eye, photons
+from . import density, emission, eye, photons, summed
 from .needs import Needs, read_scene
 from .settings import Settings
 
@@ -54,6 +55,7 @@ class Prepared:
     hide_emitters: bool
     emission: emission.Emission | None
     launch: Launch = Launch()
+    light_wavefront: int | None = None  # light paths at once; None: photons.WAVEFRONT
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -89,13 +91,21 @@ class Prepared:
 
     @property
     def use(self) -> str:
-        """How eye paths use the map; see ``eye``."""
-        return "final_gather" if self.settings.final_gather else self.settings.map
+        """How eye paths use the map; see ``eye``. ``auto`` is "global" where light comes over
+        surfaces that paths walk on, or from emitters that only photons find. Elsewhere it is
+        "caustic", which stores and gathers nothing there: path tracing is faster."""
+        if self.settings.final_gather:
+            return "final_gather"
+        if self.settings.map == "auto":
+            return "global" if self.deep or self.needs.unseen else "caustic"
+        return self.settings.map
 
     @property
     def crowding(self) -> int:
         """Share of a wavefront's eye paths that may be traced at once: where paths leave gather
         points at several vertices, fewer of them fit into the same memory."""
+        if not self.needs_map:
+            return 1
         if self.use == "caustic":
             return 8
         return 2 if self.use == "final_gather" or self.needs.general else 1
@@ -115,8 +125,10 @@ class Prepared:
     @property
     def bytes_per_photon(self) -> int:
         """Of a map at rest, index included: position and word, flux, direction, and one box of 16
-        bytes for every leaf and every inner node (at most 2 nodes for 4 photons)."""
-        return 16 + photons.flux_bytes() + (4 if self.needs.general else 0) + 8
+        bytes for every leaf and every inner node (at most 2 nodes for 4 photons), which have their
+        sums, too, where ``gather_tolerance`` asks for them."""
+        node = 16 + (20 + photons.flux_bytes() if self.settings.gather_tolerance else 0)
+        return 16 + photons.flux_bytes() + (4 if self.needs.general else 0) + node // 2
 
     @property
     def gather_depth(self) -> int:
@@ -126,6 +138,14 @@ class Prepared:
         limit = self.settings.max_depth
         tested = self.deep or self.use != "global"
         return limit if tested and 0 < limit <= photons.SEGMENTS_MAX else 0
+
+    @property
+    def kernel_options(self) -> density.KernelOptions:
+        """How gather points get their kernels."""
+        s = self.settings
+        return density.KernelOptions(
+            self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
+        )
 
     def photon_map(
         self,
@@ -154,7 +174,7 @@ class Prepared:
             wavelengths,
         )
         seed = stream_seed(seed, PHOTONS, index)
-        return photons.build_map(
+        map_ = photons.build_map(
             self.scene,
             self.emission,
             s.photon_count,
@@ -163,10 +183,16 @@ class Prepared:
             expected,
             self.launch.light,
             lap,
+            self.light_wavefront,
         )
+        if s.gather_tolerance > 0 and map_.stored:
+            map_ = replace(map_, sums=summed.build(map_))
+            lap("index")
+        return map_
 
-    def trace(self, sampler, ray, expected: int = 0):
-        """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``."""
+    def trace(self, sampler, ray, expected: int = 0, see=None):
+        """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``, and
+        ``eye.eye_paths`` for ``see``."""
         s = self.settings
         options = eye.WalkOptions(
             self.use,
@@ -174,12 +200,14 @@ class Prepared:
             s.rr_depth,
             self.min_segments,
             self.hide_emitters,
-            self.follow_lobes,
+            self.needs_map,
+            self.follow_lobes and self.needs_map,
             self.deep,
             bool(self.needs.general),
             s.gather_roughness,
         )
-        return eye.trace(self.scene, sampler, ray, options, expected, self.launch.eye)
+        launch = partial(self.launch.eye, see=see) if see else self.launch.eye
+        return eye.trace(self.scene, sampler, ray, options, expected, launch)
 
     def gather(
         self, map_, radius, seed: int, points: eye.GatherPoints, wavelengths=None
@@ -205,16 +233,19 @@ class Prepared:
         return parts
 
     def _gather(self, map_, radius, seed, points, surface) -> density.Gathered:
-        s = self.settings
-        options = density.KernelOptions(
-            self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
-        )
-        kernel, follows, degenerate = density.kernels(points, radius, options)
+        kernel, follows, degenerate = density.kernels(points, radius, self.kernel_options)
         L, count = density.estimate(
-            map_, points, kernel, radius, self.gather_depth, mi.Bool(True), surface
+            map_,
+            points,
+            kernel,
+            radius,
+            self.gather_depth,
+            mi.Bool(True),
+            surface,
+            self.settings.gather_tolerance,
         )
         lost = mi.Bool(False)
-        if s.edge_compensation:
+        if self.settings.edge_compensation:
             inverse, lost = density.probe_surface(
                 self.scene, seed, points, kernel, radius, count > 0
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
@@ -16,19 +16,26 @@ def bar(integrator, **options) -> Iterator[None]:
         with aniso_pm.progress.bar(integrator):
             image = mi.render(scene, integrator=integrator)
     """
-    from tqdm.auto import tqdm
-
-    with tqdm(unit="pass", dynamic_ncols=True, **options) as shown:
-
-        def show(done: float, total: int | None, text: str) -> None:
-            # tqdm extrapolates from what was done since it began: earlier runs are not its own.
-            if shown.n == 0 and done > 1:
-                shown.initial = int(done)
-            shown.total, shown.n = total, round(done, 2)
-            shown.set_postfix_str(text)
-
+    with shown(unit="pass", **options) as show:
         integrator.progress = show
         try:
             yield
         finally:
             integrator.progress = None
+
+
+@contextmanager
+def shown(**options) -> Iterator[Callable[[float, float | None, str], None]]:
+    """A bar that a function (done, total or None, text) sets. options: of ``tqdm``."""
+    from tqdm.auto import tqdm
+
+    with tqdm(dynamic_ncols=True, **options) as bar:
+
+        def show(done: float, total: float | None, text: str) -> None:
+            # tqdm extrapolates from what was done since it began: earlier runs are not its own.
+            if bar.n == 0 and done > 1:
+                bar.initial = int(done)
+            bar.total, bar.n = total, round(done, 2)
+            bar.set_postfix_str(text)
+
+        yield show

@@ -12,26 +12,30 @@ import itertools
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import digest, state
+from . import digest, memory, state
 from . import film as films
 from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .errors import is_interrupt
-from .pilot import automatic_photon_count, automatic_radius, camera_rays
+from .pilot import LARGEST, photons_per_path, settle
 from .prepared import EYE, PROBE, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
 from .stopping import Stopping
 
-# Eye samples traced at once: bounds memory (some 250 bytes a sample, and 400 a gather point).
+# Eye samples traced at once, where there is memory for them (see ``memory``).
 WAVEFRONT = 1 << 21
 # Passes that make the colours of a spectral picture right within about a percent.
 _SPECTRAL_PASSES = 16
+# Anisotropic meshes without texture coordinates that warnings name.
+_NAMED = 3
+# Photons in the mean kernel below which a radius that was given cannot be meant.
+_FEWEST_IN_KERNEL = 0.1
 # What a pass counts.
 _COUNTS = (
     "photons_emitted",
@@ -101,6 +105,7 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
         run.stopping.close()
     run.finish()
     _warn(statistics)
+    _warn_about_radius(scene, statistics)
     return Rendered(run.map, run.radius, run.variance)
 
 
@@ -117,9 +122,10 @@ class _Room:
     by what is frozen."""
 
     def __init__(self):
-        self.room = 0
+        self.room = self.most = 0
 
     def seen(self, count: int):
+        self.most = max(self.most, count)
         if count > self.room:
             self.room = count + count // 8
 
@@ -147,7 +153,16 @@ class _Run:
         """Pilot, or the state of an earlier run."""
         if not self.scene.scene.emitters():
             mi.Log(
-                mi.LogLevel.Warn, "aniso_pm: the scene has no emitters; the picture will be black"
+                mi.LogLevel.Warn,
+                "aniso_pm: the scene has no emitters; the picture will be black. Add one, or give "
+                'a shape the emitter "area"',
+            )
+        for surface in self.scene.needs.grainless[:_NAMED]:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'aniso_pm: the mesh "{surface}" is anisotropic but has no texture coordinates: '
+                "its grooves run along the first edge of every triangle. Give it texture "
+                "coordinates (u along the grooves' alpha_u)",
             )
         passes = self.scene.settings.passes
         if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
@@ -162,13 +177,13 @@ class _Run:
         known = earlier.identity if earlier else {}
         count = settings.photon_count or known.get("photon count")
         self.radius0 = settings.initial_radius or known.get("initial radius")
-        if not count or not self.radius0:
-            rays = camera_rays(self.sensor, self.seed)
-            samples = self.shares.each * films.pixel_count(self.film)
-            count = count or automatic_photon_count(self.scene, rays, self.seed, samples)
-            self.scene = self.scene.with_(photon_count=count)
-            self.radius0 = self.radius0 or automatic_radius(self.scene, rays, self.seed)
+        samples = self.shares.each * films.pixel_count(self.film)
+        count, self.radius0 = settle(
+            self.scene, self.sensor, self.seed, samples, count, self.radius0
+        )
         self.scene = self.scene.with_(photon_count=count)
+        self.plan = memory.plan(self.scene, *self._job())
+        self.scene = replace(self.scene, light_wavefront=self.plan.light_paths)
         self.clock.lap("pilot")
         # The response curves of a specfilm do not survive a replay of the scene that they are in.
         special = mi.has_flag(self.film.flags(), mi.FilmFlags.Special)
@@ -186,6 +201,10 @@ class _Run:
             "radius_automatic": settings.initial_radius == 0,
             "photon_count": count,
             "photon_count_automatic": settings.photon_count == 0,
+            "map": self.scene.use if self.scene.needs_map else "none",
+            "memory_estimate": self.plan.bytes / memory.GIB,
+            "wavefront_light_paths": self.plan.light_paths,
+            "wavefront_eye_samples": self.plan.eye_samples,
             **self.done.counts,
             "replayed": self.frozen,
             "relative_error": None,
@@ -194,6 +213,26 @@ class _Run:
         }
         if earlier:
             self._go_on_from(earlier)
+
+    def _job(self) -> tuple[memory.Job, Callable[[], float]]:
+        """What is to be held in memory, with a bound to the photons, and how to count those."""
+        scene, pixels = self.scene, films.pixel_count(self.film)
+        s = scene.settings
+        # Roulette ends paths with a chance of at least 1/20 a segment.
+        bound = min(s.depth_limit, s.rr_depth + 20) * s.photon_count if scene.needs_map else 0
+        at_once = pixels * self._samples_at_once(self.shares.each + bool(self.shares.one_more))
+        channels = self.film.create_block().channel_count()
+        job = memory.Job(bound, pixels, channels, self._keeps_variance(), at_once)
+        return job, lambda: photons_per_path(scene, self.seed) * s.photon_count
+
+    def _samples_at_once(self, spp: int) -> int:
+        """Samples a pixel of a wavefront, where memory is no question."""
+        pixels = films.pixel_count(self.film)
+        return max(1, min(spp, WAVEFRONT // self.scene.crowding // pixels))
+
+    def _keeps_variance(self) -> bool:
+        """Variances are worth their memory where there can be any, now or after a merge."""
+        return self.scene.settings.passes != 1 or self.controls.checkpoint is not None
 
     def _go_on_from(self, earlier: state.State):
         path = self.controls.checkpoint.path
@@ -243,14 +282,14 @@ class _Run:
             # --- One more pass is done ---
             sums = self.done.sums
             if sums is None:
-                # Variances are worth their memory where there can be any, now or after a merge.
-                variance = self.scene.settings.passes != 1 or self.controls.checkpoint is not None
-                sums = Sums.zeros(image.shape, variance)
+                sums = Sums.zeros(image.shape, self._keeps_variance())
             total = {name: n + counts.get(name, 1) for name, n in self.done.counts.items()}
             passes = state.extended(self.done.passes, index)
             self.done = _Done(sums.plus(image), passes, total)
             self.unfinished = None
             self.statistics |= {**total, "radius": self.radius}
+            estimate = self.plan.with_stored(self.photons.most).bytes / memory.GIB
+            self.statistics["memory_estimate"] = estimate
             self._check_error()
             self.clock.lap("film")
             self._report(index, 1)
@@ -282,52 +321,66 @@ class _Run:
 
     def _eye_pass(self, index, spp, colour, counts):
         """Trace ``spp`` eye samples a pixel against the map, wavefront by wavefront; yields (image
-        so far as film blocks hold it, samples a pixel so far)."""
+        so far as film blocks hold it, samples a pixel so far). Where memory is short a wavefront
+        has a part of the pixels, one sample each."""
         scene, sensor, map_ = self.scene, self.sensor, self.map
         film = sensor.film()
         pixels = films.pixel_count(film)
-        per_wavefront = max(1, min(spp, WAVEFRONT // scene.crowding // pixels))
+        per_wavefront = self._samples_at_once(spp)
+        at_once = pixels
+        if pixels * per_wavefront > self.plan.eye_samples:
+            per_wavefront = max(1, self.plan.eye_samples // pixels)
+            at_once = min(pixels, self.plan.eye_samples)
         # An array, not a number: as a literal it would make every pass compile kernels of its own.
         radius = dr.opaque(mi.Float, self.radius)
         image = None
         taken = wavefront = 0
         while taken < spp:
-            sampler = sensor.sampler().clone()
-            sampler.set_sample_count(min(per_wavefront, spp - taken))
-            count = sampler.sample_count()  # samplers may round it up
-            sampler.set_samples_per_wavefront(count)
-            seed = mi.sample_tea_32(stream_seed(self.seed, EYE, index), wavefront)[0]
-            sampler.seed(seed, pixels * count)
+            for first in range(0, pixels, at_once):
+                some = min(at_once, pixels - first)
+                sampler = sensor.sampler().clone()
+                sampler.set_sample_count(min(per_wavefront, spp - taken))
+                count = sampler.sample_count()  # samplers may round it up
+                sampler.set_samples_per_wavefront(count)
+                seed = mi.sample_tea_32(stream_seed(self.seed, EYE, index), wavefront)[0]
+                sampler.seed(seed, some * count)
 
-            # --- Eye paths and density estimation ---
-            ray, ray_weight, position = films.sample_rays(sensor, sampler, count, colour)
-            dr.eval(ray, ray_weight, position)
-            seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
-            room = self.points.room
-            seen = scene.radiance(sampler, ray, map_, radius, seed, room, self.clock.lap)
-            for found in seen.gathered:
-                counts["gather_points"] += dr.width(found.lane)
-                counts["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
-                counts["gather_points_clamped"] += int(dr.count(found.clamped)[0])
-                counts["gather_points_capped"] += int(dr.count(found.capped)[0])
-                counts["gather_points_degenerate"] += int(dr.count(found.degenerate)[0])
-                counts["gather_points_off_surface"] += int(dr.count(found.lost)[0])
-                counts["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
-            self.points.seen(sum(dr.width(found.lane) for found in seen.gathered))
+                # --- Eye paths and density estimation ---
+                ray, ray_weight, position = films.sample_rays(
+                    sensor, sampler, count, colour, first, some
+                )
+                dr.eval(ray, ray_weight, position)
+                seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
+                room = self.points.room
+                seen = scene.radiance(sampler, ray, map_, radius, seed, room, self.clock.lap)
+                self._count(seen.gathered, counts)
 
-            # --- Into the image ---
-            finite = dr.all(dr.isfinite(seen.L))
-            counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
-            L = dr.select(finite, seen.L, 0) * ray_weight
-            splats = films.splat(film, position, L, seen.valid, count, ray.wavelengths)
-            image = splats if image is None else image + splats
-            dr.eval(image)
-            self.clock.lap("film")
-            counts["eye_samples"] += pixels * count
-            counts["spp"] += count
+                # --- Into the image ---
+                finite = dr.all(dr.isfinite(seen.L))
+                counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
+                L = dr.select(finite, seen.L, 0) * ray_weight
+                splats = films.splat(film, position, L, seen.valid, count, ray.wavelengths)
+                image = splats if image is None else image + splats
+                dr.eval(image)
+                self.clock.lap("film")
+                counts["eye_samples"] += some * count
+                wavefront += 1
+                part = (first + some) / pixels
+                if part == 1:
+                    counts["spp"] += count
+                yield image, min(taken + part * count, spp)
             taken += count
-            wavefront += 1
-            yield image, min(taken, spp)
+
+    def _count(self, gathered, counts):
+        for found in gathered:
+            counts["gather_points"] += dr.width(found.lane)
+            counts["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
+            counts["gather_points_clamped"] += int(dr.count(found.clamped)[0])
+            counts["gather_points_capped"] += int(dr.count(found.capped)[0])
+            counts["gather_points_degenerate"] += int(dr.count(found.degenerate)[0])
+            counts["gather_points_off_surface"] += int(dr.count(found.lost)[0])
+            counts["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
+        self.points.seen(sum(dr.width(found.lane) for found in gathered))
 
     # --- After a pass ---
 
@@ -366,6 +419,8 @@ class _Run:
             checkpoint.write(self._state())
             if checkpoint.on_write:
                 checkpoint.on_write()
+        if due or callback:
+            self.clock.lap("output")
 
     def _state(self) -> state.State:
         return state.State(
@@ -412,6 +467,25 @@ def _warn(statistics):
             mi.LogLevel.Warn,
             f"aniso_pm: {statistics['eye_samples_rejected']} of {statistics['eye_samples']} eye "
             "samples were not finite and count as black",
+        )
+
+
+def _warn_about_radius(scene, statistics):
+    """A radius that somebody has chosen may be right in other units."""
+    radius, points = scene.settings.initial_radius, statistics["gather_points"]
+    if not radius or not points or not statistics["photons_stored"]:
+        return
+    mean = statistics["photons_gathered"] / points
+    wrong = None
+    if mean < _FEWEST_IN_KERNEL:
+        wrong = f"kernels hold {mean:.2g} photons in the mean, the rest is noise"
+    elif radius > LARGEST * scene.extent:
+        wrong = "kernels reach across much of it and blur everything"
+    if wrong:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'aniso_pm: parameter "initial_radius" is {radius:g} in a scene that is '
+            f"{scene.extent:.3g} large: {wrong}. Lengths are in world units; 0 is automatic",
         )
 
 

@@ -31,9 +31,11 @@ class Settings:
     target_error: float = 0.0
     alpha: float = 2 / 3
     initial_radius: float = 0.0
+    gather_tolerance: float = 0.0
     edge_compensation: bool = True
     max_depth: int = -1
     rr_depth: int = 5
+    max_memory: float = 0.0
 
     def __post_init__(self):
         for field in fields(self):
@@ -53,7 +55,7 @@ class Settings:
         self._one_of("size", "bandwidth", "epsilon")
         self._between("epsilon", 1e-8, 10)
         self._between("max_aspect", 1, 1e4)
-        self._one_of("map", "global", "caustic")
+        self._one_of("map", "global", "caustic", "auto")
         if self.final_gather and self.map != "global":
             raise ValueError(
                 f'aniso_pm: parameter "final_gather" needs the global map, but "map" is '
@@ -68,8 +70,10 @@ class Settings:
         self._between("passes", 0, 10**7, words, not endless)
         self._between("alpha", 0, 1, "above 0 and at most 1", self.alpha > 0)
         self._between("initial_radius", 0, 1e30, "0 (automatic) or a positive length")
+        self._between("gather_tolerance", 0, 1)
         self._between("max_depth", -1, 10**6, "-1 (unlimited) or 1 and more", self.max_depth != 0)
         self._between("rr_depth", 1, 10**6)
+        self._between("max_memory", 0, 1e6, "0 (automatic) or a positive number of GiB")
 
     def _one_of(self, name, *choices):
         value = getattr(self, name)

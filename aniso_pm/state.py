@@ -65,9 +65,10 @@ class State:
         del header["arrays"]
         header = output.plain(header) | {"format": "aniso_pm state", "version": VERSION}
         header["sha256"] = _checksum(header, self.arrays)
-        text = np.array(json.dumps(header, ensure_ascii=False))
+        entries: dict[str, Any] = {"header": np.array(json.dumps(header, ensure_ascii=False))}
+        entries |= self.arrays
         with output.replacing(path) as partial, open(partial, "wb") as file:
-            np.savez(file, header=text, **self.arrays)
+            np.savez(file, **entries)
 
     @staticmethod
     def load(path: Path) -> State:
@@ -168,7 +169,7 @@ def _checksum(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
     for name in _ARRAYS:
         array = np.ascontiguousarray(arrays[name])
         sha.update(f"{name} {array.dtype} {array.shape}".encode())
-        sha.update(array)
+        sha.update(array.data)
     return sha.hexdigest()
 
 
@@ -187,7 +188,7 @@ class Checkpoint:
     path: Path
     every: float = 30.0
     resume: bool = False
-    on_write: Callable[[], None] | None = None
+    on_write: Callable[[], Any] | None = None
 
     def __post_init__(self):
         self._written = time.perf_counter()

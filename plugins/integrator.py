@@ -115,6 +115,13 @@ class AnisoPhotonMapper:
        - The kernel's area shrinks by :math:`(i+\alpha)/(i+1)` after pass :math:`i`, above 0 and at
          most 1. (Default: 2/3)
 
+     * - gather_tolerance
+       - |float|
+       - Error that the sum over a kernel may have, as a share of the flux inside it, between 0 and
+         1: small groups of photons inside a kernel count as one. Kernels of thousands of photons
+         gain (five times faster at 9,000 and 0.2), small ones nothing. Receivers that are not
+         Lambertian are summed photon by photon. 0 is the exact sum. (Default: 0)
+
      * - edge_compensation
        - |bool|
        - Divide each estimate by the share of its kernel that lies on the surface, found by short
@@ -171,6 +178,8 @@ class AnisoPhotonMapper:
             'photon_count': 500_000,
             'passes': 16
     """
+
+    hide_emitters: bool  # set by Mitsuba's own constructor
 
     def __init__(self, props):
         # Mitsuba's own complaint names neither the value nor what it may be.

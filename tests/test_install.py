@@ -138,7 +138,7 @@ def test_every_package_is_listed_for_installation():
 def built(tmp_path_factory):
     """Wheel and source distribution, built from a copy so that the sources stay clean."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
-    for name in ("aniso_pm", "plugins"):
+    for name in ("aniso_pm", "plugins", "scenes"):
         shutil.copytree(ROOT / name, source / name)
     for name in ("pyproject.toml", "LICENSE", "README.md"):
         shutil.copy(ROOT / name, source / name)
@@ -148,18 +148,44 @@ def built(tmp_path_factory):
     return next(out.glob("*.whl")), next(out.glob("*.tar.gz"))
 
 
-def test_wheel_and_sdist_contain_the_plugins(built):
+def test_wheel_and_sdist_contain_the_plugins_and_the_gallery(built):
     wheel, sdist = built
     names = zipfile.ZipFile(wheel).namelist()
     assert {"aniso_pm/plugins/__init__.py", "aniso_pm/py.typed"} <= set(names)
+    assert {"aniso_pm/scenes/teapot.xml", "aniso_pm/scenes/meshes/pan.ply"} <= set(names)
+    assert wheel.stat().st_size < 8 * 2**20
     assert {f"aniso_pm/stability/page.{kind}.j2" for kind in ("html", "md")} <= set(names)
+    assert {"aniso_pm/report/page.html.j2", "aniso_pm/report/results.schema.json"} <= set(names)
     with tarfile.open(sdist) as archive:
-        assert any(name.endswith("/plugins/__init__.py") for name in archive.getnames())
+        for part in ("/plugins/__init__.py", "/scenes/references/plain_room.exr"):
+            assert any(name.endswith(part) for name in archive.getnames())
 
 
 def test_the_wheel_works_without_the_sources(built, tmp_path):
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", tmp_path]
     subprocess.run([*command, built[0]], check=True)
+    path = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
     code = "import aniso_pm.plugins; print(aniso_pm.plugins.__file__)"
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {code}"
-    assert run_python(code, tmp_path).stdout.startswith(str(tmp_path))
+    assert run_python(path + code, tmp_path).stdout.startswith(str(tmp_path))
+
+    code = (
+        "from aniso_pm import cli, gallery; cli.main(['scenes', 'here']); print(gallery.__file__)"
+    )
+    run = run_python(path + code, tmp_path)
+    assert run.stdout.splitlines()[-1].startswith(str(tmp_path)), run.stderr
+    for kind in ("*.xml", "meshes/*.ply", "textures/*.png", "references/*.exr"):
+        copied = sorted((tmp_path / "here").glob(kind))
+        shipped = sorted((ROOT / "scenes").glob(kind))
+        assert [p.read_bytes() for p in copied] == [p.read_bytes() for p in shipped] != []
+
+
+def test_python_started_in_a_clone_finds_the_plugins_beside_the_package(tmp_path):
+    """As after `pip install .` in a clone, whose folder hides what is installed."""
+    code = (
+        "import sys\n"
+        "sys.meta_path = [f for f in sys.meta_path if 'editable' not in repr(f).lower()]\n"
+        f"sys.path.insert(0, {str(ROOT)!r})\n"
+        "import aniso_pm.plugins.integrator as i; print(i.__file__)"
+    )
+    run = run_python(code, tmp_path)
+    assert run.stdout.strip() == str(ROOT / "plugins" / "integrator.py"), run.stderr

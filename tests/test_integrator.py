@@ -408,6 +408,7 @@ def test_hidden_sky_stays_hidden_behind_null_surfaces_as_in_path(rgb, front):
         ("epsilon", 0.0, "between"),
         ("epsilon", float("nan"), "between"),
         ("max_aspect", 0.5, "between"),
+        ("gather_tolerance", 1.5, "between 0 and 1"),
         ("photon_count", -5, "between"),
         ("photon_count", 1.5, "integer"),
         ("photon_count", "many", "integer"),

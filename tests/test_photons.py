@@ -165,7 +165,7 @@ def test_normals_survive_their_encoding():
     n /= np.linalg.norm(n, axis=1)[:, None]
     n[:6] = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]
     v = mi.Vector3f(np.ascontiguousarray(n.T.astype(np.float32)))
-    back = photons._decode(photons.encode_normal(v) | (77 << 24), 12).numpy().T
+    back = photons.decode_normal(photons.encode_normal(v) | (77 << 24)).numpy().T
     assert (back * n).sum(1).min() > np.cos(np.radians(0.07))  # 12 bits a coordinate
 
 
@@ -200,6 +200,6 @@ def test_faces_is_the_cosine_of_the_decoded_normal():
     b[:, ::2] = a[:, ::2] + 0.8 * b[:, ::2]  # half of them near the threshold
     a, b = (mi.Normal3f(v / np.linalg.norm(v, axis=0)) for v in (a, b))
     word = photons.encode_normal(a) | (5 << 24) | (1 << 31)
-    cosine = np.sum(np.array(photons._decode(word, 12)) * np.array(b), axis=0)
+    cosine = np.sum(np.array(photons.decode_normal(word)) * np.array(b), axis=0)
     clear = np.abs(cosine - 0.75) > 1e-5
     np.testing.assert_array_equal(photons.faces(word, b).numpy()[clear], (cosine > 0.75)[clear])

@@ -1,12 +1,12 @@
 """The scenes that come with the library: they load, and they show what their references show."""
 
-import importlib.util
 from pathlib import Path
 
 import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
 import pytest
+from aniso_pm.report import reference as references
 
 SCENES = Path(__file__).parents[1] / "scenes"
 
@@ -16,16 +16,9 @@ def _variant(variant_llvm_rgb):
     pass
 
 
-def load_script(name):
-    spec = importlib.util.spec_from_file_location(name, SCENES / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("name", ["teapot", "fry_pan"])
 def test_scene_agrees_with_its_reference_at_a_tenth_of_the_size(name):
-    reference, noise = load_script("make_pictures").read_reference(name)
+    reference = references.read(SCENES / "references" / f"{name}.exr").mean
     scene = mi.load_file(str(SCENES / f"{name}.xml"), width="64", height="48")
     image = np.array(mi.render(scene, spp=256), dtype=np.float64)[..., :3]
     small = reference.reshape(48, 10, 64, 10, 3).mean((1, 3))
@@ -35,7 +28,7 @@ def test_scene_agrees_with_its_reference_at_a_tenth_of_the_size(name):
 
 
 def test_glass_balls_agree_with_their_reference_at_half_the_size():
-    reference, noise = load_script("make_pictures").read_reference("glass_balls")
+    reference = references.read(SCENES / "references" / "glass_balls.exr").mean
     scene = mi.load_file(str(SCENES / "glass_balls.xml"), width="80", height="60")
     image = np.array(mi.render(scene, spp=128), dtype=np.float64)[..., :3]
     small = reference.reshape(60, 2, 80, 2, 3).mean((1, 3))

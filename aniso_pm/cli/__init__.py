@@ -16,11 +16,11 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import InputError, is_interrupt, one_line
 
-from . import bench, examine, render
+from . import bench, examine, explain, reference, render, report, scenes
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -77,7 +77,11 @@ def _program(
 for command in (
     render.render,
     render.merge,
+    reference.reference,
+    report.report,
+    scenes.scenes,
     examine.inspect,
+    explain.explain,
     examine.stability,
     examine.doctor,
     bench.bench,

@@ -32,7 +32,7 @@ def make_directory(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot write into '{path}': {error.strerror or error}") from error
-    output.check_writable(path / "stability.json")
+    output.check_writable(path / "any.json")
 
 
 def parse_defines(pairs: list[str]) -> dict[str, str]:

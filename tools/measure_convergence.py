@@ -1,4 +1,4 @@
-"""Error against passes: ``python scenes/measure_convergence.py`` makes pictures/convergence.svg.
+"""Error against passes: ``python tools/measure_convergence.py``.
 
 Each scene is rendered with several seeds in small passes, and the picture is kept after 1, 4, 16, …
 passes. Errors count relative to R² + 0.01; R² is the mean of R1 R2 over 3 × 3 pixels of the two
@@ -13,8 +13,8 @@ scatters is shown by a bootstrap over seeds and blocks of pixels: 95 % intervals
 three of its standard errors of zero cannot be told from the reference's noise; it is drawn hollow
 and does not count for the slope.
 
-``--reference NAME --spp N`` renders a reference with ``path`` first. Needs matplotlib, which the
-extra ``dev`` brings.
+Writes ``scenes/pictures/convergence.svg`` and ``.json``. Needs matplotlib, which the extra ``dev``
+brings.
 """
 
 import argparse
@@ -24,7 +24,9 @@ from dataclasses import dataclass
 import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
-from make_pictures import HERE, make_reference, read_reference
+from aniso_pm.report import reference as references
+from aniso_pm.report.metrics import weights
+from make_pictures import SCENES
 
 # What is looked at: left, top, width, height in pixels of the reference.
 WINDOWS = {
@@ -68,16 +70,16 @@ class Curve:
 
 def load(name):
     """Scene with the window as its crop window, and the reference's halves there."""
-    scene = mi.load_file(str(HERE / f"{name}.xml"), optimize=False)
+    scene = mi.load_file(str(SCENES / f"{name}.xml"), optimize=False)
     left, top, width, height = WINDOWS[name]
     sensor = scene.sensors()[0]
     parameters = mi.traverse(sensor)
     parameters["film.crop_offset"] = [left, top]
     parameters["film.crop_size"] = [width, height]
     parameters.update()
-    mean, half_difference = read_reference(name)
+    reference = references.read(SCENES / "references" / f"{name}.exr")
     rows, columns = slice(top, top + height), slice(left, left + width)
-    halves = [(mean + k * half_difference)[rows, columns] for k in (1, -1)]
+    halves = [half[rows, columns] for half in reference.halves]
     return scene, halves
 
 
@@ -101,13 +103,6 @@ def products(images, halves):
     scale = weights(halves) ** 0.5
     first, second = (by_block(scale * (images - half)) for half in halves)
     return first @ second.transpose(0, 2, 1) / first.shape[-1]
-
-
-def weights(halves):
-    """1/(R² + 0.01) of each pixel and colour, see above."""
-    level = np.pad(halves[0] * halves[1], ((1, 1), (1, 1), (0, 0)), mode="edge")
-    level = np.lib.stride_tricks.sliding_window_view(level, (3, 3), (0, 1)).mean((-1, -2))
-    return 1 / (np.maximum(level, 0) + 0.01)
 
 
 def by_block(values):
@@ -229,18 +224,14 @@ def plot(results, path):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--reference", choices=list(WINDOWS), help="render this reference, no more")
     parser.add_argument("--scenes", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
     parser.add_argument("--photons", type=int, default=100_000, help="light paths per pass")
-    parser.add_argument("--spp", type=int, help="samples per pass (2), or of the reference (32768)")
+    parser.add_argument("--spp", type=int, default=2, help="samples per pass")
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    if arguments.reference:
-        make_reference(arguments.reference, arguments.spp or 32768)
-    else:
-        # Scenes that are not measured now keep what was measured before.
-        file = HERE / "pictures" / "convergence.json"
-        measured = json.loads(file.read_text()) if file.exists() else {}
-        measured |= run(arguments.scenes, arguments.photons, arguments.spp or 2)
-        file.write_text(json.dumps(measured, indent=1, ensure_ascii=False) + "\n")
-        plot(measured, file.with_suffix(".svg"))
+    # Scenes that are not measured now keep what was measured before.
+    file = SCENES / "pictures" / "convergence.json"
+    measured = json.loads(file.read_text()) if file.exists() else {}
+    measured |= run(arguments.scenes, arguments.photons, arguments.spp)
+    file.write_text(json.dumps(measured, indent=1, ensure_ascii=False) + "\n")
+    plot(measured, file.with_suffix(".svg"))

@@ -1,4 +1,4 @@
-"""What rule and guard do to the metal of the two scenes: ``python scenes/measure_rules.py``.
+"""What rule and guard do to the metal of the two scenes: ``python tools/measure_rules.py``.
 
 One pass at the automatic bandwidth, every kernel with the same photons and the same eye paths,
 over several seeds. For the pixels that show metal, relative to R² + 0.01: variance, bias² (product
@@ -13,8 +13,9 @@ import aniso_pm  # noqa: F401
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from make_pictures import HERE, SCENES, read_reference, render
-from measure_convergence import weights
+from aniso_pm.report import reference as references
+from aniso_pm.report.metrics import weights
+from make_pictures import CLOSE_UPS, SCENES, render
 
 KERNELS = [("isotropic", "lobe", True)] + [
     ("anisotropic", rule, guard) for rule in ("lobe", "taylor", "paper") for guard in (True, False)
@@ -33,18 +34,20 @@ def metal_pixels(scene):
 
 
 def measure(name, seeds, spp):
-    scene = mi.load_file(str(HERE / f"{name}.xml"))
+    scene = mi.load_file(str(SCENES / f"{name}.xml"))
     mask = metal_pixels(scene)
-    reference, noise = read_reference(name)
-    first, second = ((reference + k * noise)[mask] for k in (1, -1))
+    reference = references.read(SCENES / "references" / f"{name}.exr")
+    first, second = (half[mask] for half in reference.halves)
     # Not 1/(R² + 0.01) of the same noisy pixel: its error would weigh itself.
-    weight = weights((reference + noise, reference - noise))[mask]
+    weight = weights(reference.halves)[mask]
     base = {"type": "aniso_pm", "photon_count": 100_000}
     direct = [render(scene, base | {"max_depth": 2}, spp, s)[0][mask].mean() for s in range(seeds)]
     print(
         f"\n{name}: {seeds} seeds, {spp} spp, {mask.mean():.0%} of the pixels show metal; ", end=""
     )
-    print(f"variance of the reference {np.mean(weight * noise[mask] ** 2):.1e}\n")
+    print(
+        f"variance of the reference {np.mean(weight * reference.half_difference[mask] ** 2):.1e}\n"
+    )
     print("| kernel | rule | guard | variance | bias² | energy, indirect | fallbacks |")
     print("|---|---|---|---|---|---|---|")
     isotropic = None
@@ -79,5 +82,5 @@ if __name__ == "__main__":
     parser.add_argument("--spp", type=int, default=16)
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    for scene_name in SCENES:
+    for scene_name in CLOSE_UPS:
         measure(scene_name, arguments.seeds, arguments.spp)

@@ -1,0 +1,1 @@
+"""Error against run time: references, runs, metrics, plots and the page."""

@@ -1,0 +1,1 @@
+"""The gallery: scenes with their meshes, textures and references; see README.md."""

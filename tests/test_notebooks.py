@@ -1,0 +1,37 @@
+"""Notebooks are stored without outputs and run from top to bottom."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+
+def read(path):
+    return nbformat.read(path, as_version=4)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_are_stored_without_outputs(path):
+    notebook = read(path)
+    nbformat.validate(notebook)
+    for cell in notebook.cells:
+        assert not cell.get("outputs") and cell.get("execution_count") is None, cell.source
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run_and_show_pictures(path):
+    notebook = read(path)
+    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": path.parent}}).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    # What widgets show, errors included, is in their own state.
+    widgets = notebook.metadata.get("widgets", {})
+    states = [s["state"] for part in widgets.values() for s in part["state"].values()]
+    outputs += [output for state in states for output in state.get("outputs", [])]
+    errors = [output for output in outputs if output["output_type"] == "error"]
+    assert not errors
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    told = [o["text"] for o in outputs if o.get("name") == "stderr"]
+    assert not any("Warning" in text for text in told), told

@@ -1,0 +1,388 @@
+"""The report from end to end on a small scene, and what it must not get wrong."""
+
+import json
+import re
+import sys
+from importlib import resources
+
+import aniso_pm  # noqa: F401
+import jsonschema
+import mitsuba as mi
+import numpy as np
+import pytest
+from aniso_pm import cli, density
+from aniso_pm.errors import InputError
+from aniso_pm.prepared import prepare
+from aniso_pm.report import cells, experiment, make, methods, metrics, reference, regions, runs
+from aniso_pm.report.plan import Plan
+from aniso_pm.settings import Settings
+from rooms import room, room_with_ball, room_with_plate
+
+SCENE = """<scene version="3.0.0">
+  <default name="width" value="32"/>
+  <integrator type="aniso_pm"><integer name="max_depth" value="6"/></integrator>
+  <sensor type="perspective">
+    <float name="fov" value="60"/>
+    <transform name="to_world">
+      <lookat origin="0, -2.4, 1.6" target="0, 0, 0.5" up="0, 0, 1"/>
+    </transform>
+    <sampler type="independent"/>
+    <film type="hdrfilm">
+      <integer name="width" value="$width"/> <integer name="height" value="24"/>
+      <rfilter type="box"/>
+    </film>
+  </sensor>
+  <shape type="rectangle">
+    <transform name="to_world"><scale value="2"/></transform>
+    <bsdf type="diffuse"/>
+  </shape>
+  <shape type="rectangle">
+    <transform name="to_world">
+      <scale value="0.9"/> <rotate x="1" angle="110"/> <translate y="1" z="0.8"/>
+    </transform>
+    <bsdf type="twosided"><bsdf type="roughconductor">
+      <float name="alpha_u" value="0.05"/> <float name="alpha_v" value="0.3"/>
+    </bsdf></bsdf>
+  </shape>
+  <shape type="sphere">
+    <point name="center" x="0.5" y="-0.4" z="0.4"/> <float name="radius" value="0.4"/>
+    <bsdf type="dielectric"/>
+  </shape>
+  <shape type="rectangle">
+    <transform name="to_world">
+      <scale value="0.7"/> <rotate x="1" angle="180"/> <translate z="2.5"/>
+    </transform>
+    <emitter type="area"><rgb name="radiance" value="4"/></emitter>
+  </shape>
+</scene>
+"""
+QUICK = ("--quick", "--time", "0.4", "--photons", "3000", "--spp", "1")
+
+
+@pytest.fixture(autouse=True)
+def _variant(variant_llvm_rgb):
+    pass
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A scene's file with its reference beside it."""
+    mi.set_variant("llvm_ad_rgb")
+    file = tmp_path_factory.mktemp("scenes") / "tiny.xml"
+    file.write_text(SCENE)
+    (file.parent / "references").mkdir()
+    world, sensor = make.load(file, {}, 0)
+    made = reference.make(world, sensor, spp=4096)
+    reference.write(file.parent / "references" / "tiny.exr", made)
+    return file
+
+
+@pytest.fixture(scope="module")
+def done(scene, tmp_path_factory):
+    """A quick report by the program: its directory."""
+    out = tmp_path_factory.mktemp("report")
+    assert cli.main(["report", str(scene), "-o", str(out), *QUICK]) == 0
+    return out
+
+
+def results(out):
+    return json.loads((out / "results.json").read_text())
+
+
+# --- Files ---
+
+
+def test_results_keep_to_their_schema(done):
+    schema = json.loads(
+        resources.files("aniso_pm.report").joinpath("results.schema.json").read_text()
+    )
+    jsonschema.validate(results(done), schema)
+
+
+def test_all_that_was_asked_for_is_in_the_table(done):
+    found = results(done)
+    last = [r for r in found["rows"] if r["budget"] == found["plan"]["times"][-1]]
+    wanted = {"isotropic/default", "isotropic/best", "lobe/default", "lobe/best", "path"}
+    assert {r["method"] for r in last} == wanted
+    assert {r["region"] for r in last} == {"whole", "anisotropic", "caustic"}
+    for row in found["rows"]:
+        assert row["seconds"] <= row["budget"] and row["passes"] >= 1 and row["seeds"] == 3
+        parts = row["variance"]["value"] + row["bias2"]["value"]
+        assert parts == pytest.approx(row["relative_mse"]["value"], rel=1e-6)
+    pairs = {(r["method"], r["base"]) for r in found["ratios"]}
+    assert ("lobe/best", "isotropic/best") in pairs and ("lobe/default", "path") in pairs
+    assert ("lobe/best", "isotropic/default") not in pairs
+
+
+def test_path_agrees_with_the_reference_and_photon_mapping_nearly(done):
+    found = results(done)
+    for row in found["rows"]:
+        if row["budget"] == found["plan"]["times"][-1] and row["region"] == "whole":
+            # Photon mapping with 3000 light paths a pass has a bias, and path noise.
+            assert row["energy"]["value"] == pytest.approx(1, abs=0.05), row["method"]
+
+
+def test_page_needs_no_other_file_and_shows_every_figure(done):
+    text = (done / "index.html").read_text()
+    sources = re.findall(r'(?:src|href)="([^"]{1,30})', text)
+    assert sources and all(s.startswith(("data:image/", "#")) for s in sources)
+    assert "built-in" not in text and "Undefined" not in text
+    svgs = {p.stem for p in (done / "figures").glob("*.svg")}
+    assert {"tiny-error-whole", "tiny-split-anisotropic", "tiny-bandwidth-large"} <= svgs
+    assert svgs <= {p.stem for p in (done / "figures").glob("*.png")}
+    assert text.count("data:image/svg+xml") == len(svgs)
+
+
+@pytest.mark.slow
+def test_running_it_twice_gives_the_same_ratios_within_their_intervals(scene, done, tmp_path):
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *QUICK]) == 0
+
+    def ratios(out):
+        return {
+            (r["method"], r["base"], r["region"], r["budget"]): r
+            for r in results(out)["ratios"]
+            if r["low"] is not None
+        }
+
+    first, second = ratios(done), ratios(tmp_path)
+    both = first.keys() & second.keys()
+    assert len(both) >= 12
+    # Each interval has 95 %: two of them miss each other more rarely still.
+    apart = [
+        key
+        for key in both
+        if first[key]["high"] < second[key]["low"] or second[key]["high"] < first[key]["low"]
+    ]
+    assert len(apart) <= 0.1 * len(both), apart
+    verdicts = {(first[key]["verdict"], second[key]["verdict"]) for key in both}
+    assert not verdicts & {("better", "worse"), ("worse", "better")}
+
+
+# --- Going on, failing ---
+
+
+def test_a_report_goes_on_from_the_cells_that_are_there(scene, done, tmp_path, monkeypatch):
+    """As after kill -9: some cells are there, one was damaged, the rest was never begun."""
+    (tmp_path / "cells").symlink_to(done / "cells")
+    kept = {path: path.stat().st_mtime_ns for path in (done / "cells" / "tiny").iterdir()}
+    (done / "cells/tiny/path-1.npz").unlink()
+    (done / "cells/tiny/lobe_default-2.npz").write_bytes(b"PK half a file")
+    ran = []
+    run = runs.run
+
+    def counted(stage, method, radius, seed, budgets):
+        ran.append((method.name, seed))
+        return run(stage, method, radius, seed, budgets)
+
+    monkeypatch.setattr(runs, "run", counted)
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *QUICK]) == 0
+    assert set(ran) == {("lobe/default", 2), ("path", 1)}
+    again = [r for r in results(tmp_path)["rows"] if r["method"] == "isotropic/best"]
+    assert again == [r for r in results(done)["rows"] if r["method"] == "isotropic/best"]
+    untouched = [p for p in kept if p.name not in ("path-1.npz", "lobe_default-2.npz")]
+    assert all(p.stat().st_mtime_ns == kept[p] for p in untouched)
+
+
+def test_a_cell_that_fails_does_not_take_the_others_with_it(scene, tmp_path, monkeypatch, capfd):
+    run = runs.run
+
+    def failing(stage, method, radius, seed, budgets):
+        if method.name == "path" and seed == 1:
+            raise RuntimeError("the lamp fell over")
+        return run(stage, method, radius, seed, budgets)
+
+    monkeypatch.setattr(runs, "run", failing)
+    names = ("--method", "path", "--method", "isotropic/default", "--seeds", "4", "--budgets", "2")
+    arguments = ["report", str(scene), "-o", str(tmp_path), *QUICK, *names]
+    assert cli.main(arguments) == 1
+    assert "path, seed 1 failed: the lamp fell over" in capfd.readouterr().out
+    found = results(tmp_path)
+    assert found["scenes"][0]["failures"][0]["reason"] == "the lamp fell over"
+    assert {row["seeds"] for row in found["rows"] if row["method"] == "path"} == {3}
+    assert any(r["base"] == "path" and r["value"] for r in found["ratios"])
+    # The next time the failed one is tried again, and nothing else.
+    monkeypatch.setattr(runs, "run", run)
+    assert cli.main(arguments) == 0
+    assert {row["seeds"] for row in results(tmp_path)["rows"]} == {4}
+
+
+def test_a_scene_that_is_not_for_photons_is_still_rendered_by_path(scene, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise ValueError("aniso_pm: fog is not supported")
+
+    monkeypatch.setattr(experiment, "prepare", refuse)
+    names = ("--method", "path", "--method", "lobe/default", "--budgets", "2")
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *QUICK, *names]) == 1
+    found = results(tmp_path)
+    assert {row["method"] for row in found["rows"]} == {"path"}
+    (failure,) = found["scenes"][0]["failures"]
+    assert failure["method"] == "lobe/default" and "fog" in failure["reason"]
+    assert "fog is not supported" in (tmp_path / "index.html").read_text()
+
+
+def test_cells_of_another_plan_do_not_count(tmp_path):
+    store = cells.Store(tmp_path)
+    store.put("a", {"seed": 1}, {"x": float("nan")}, {"image": np.ones(3)})
+    assert store.get("a", {"seed": 2}) is None and store.stale == ["a"]
+    assert store.get("a", {"seed": 1}).arrays["image"].tolist() == [1, 1, 1]
+    store.put("b", {}, {"error": "no"})
+    assert store.get("b", {}) is None
+
+
+def test_interrupted_reports_keep_what_is_done(scene, tmp_path, monkeypatch, capfd):
+    run = runs.run
+
+    def interrupted(stage, method, radius, seed, budgets):
+        if seed == 1:
+            raise KeyboardInterrupt
+        return run(stage, method, radius, seed, budgets)
+
+    monkeypatch.setattr(runs, "run", interrupted)
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *QUICK, "--method", "path"]) == 130
+    assert "goes on from here" in capfd.readouterr().err
+    assert (tmp_path / "cells/tiny/path-0.npz").exists()
+    assert not (tmp_path / "cells/tiny/path-1.npz").exists()
+
+
+# --- Wrong input ---
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--method", "pathh"], "pathh"),
+        (["--method", "lobe/worst"], "default, best"),
+        (["--method", "aniso_pm"], "name a kernel instead"),
+        (["--method", "path:max_depth"], "KEY=VALUE"),
+        (["--seeds", "2"], "seeds is 2"),
+        (["--time", "0.01"], "seconds is 0.01"),
+        (["-D", "width=40"], "aniso-pm reference"),
+    ],
+)
+def test_wrong_input_is_said_in_one_line_before_anything_runs(
+    scene, tmp_path, capfd, arguments, words
+):
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *arguments]) == 2
+    error = capfd.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert not (tmp_path / "results.json").exists()
+
+
+def test_a_missing_package_is_named_with_its_remedy(scene, tmp_path, monkeypatch, capfd):
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    assert cli.main(["report", str(scene), "-o", str(tmp_path)]) == 2
+    assert "pip install 'aniso-pm[report]'" in capfd.readouterr().err
+
+
+def test_names_stand_for_methods():
+    found = methods.parse_all(["isotropic", "lobe/best", "path:max_depth=3,hide_emitters=true"])
+    assert [m.name for m in found][:3] == ["isotropic/default", "isotropic/best", "lobe/best"]
+    assert found[2].plugin["rule"] == "lobe"
+    assert found[3].plugin == {"type": "path", "max_depth": 3, "hide_emitters": True}
+    with pytest.raises(InputError, match="not an integrator"):
+        methods.parse("independent")
+
+
+def test_budgets_span_two_decades():
+    times = Plan().times
+    assert len(times) >= 6 and times[-1] / times[0] == pytest.approx(100, rel=0.01)
+
+
+# --- What it measures ---
+
+
+def stage_of(world, photons=30_000):
+    return runs.Stage(world, world.sensors()[0], {}, {}, photons, 1)
+
+
+@pytest.mark.parametrize("dark", [1.0, 0.9])
+def test_a_dark_method_shows_in_energy_and_bias(monkeypatch, dark):
+    """Kernels normalised to 0.9 lose a tenth of the indirect light, 3 % of all light here."""
+    world = mi.load_dict(room(size=24))
+    ref = reference.make(world, world.sensors()[0], spp=8192)
+    estimate = density.estimate
+
+    def darker(*arguments, **options):
+        radiance, count = estimate(*arguments, **options)
+        return dark * radiance, count
+
+    monkeypatch.setattr(density, "estimate", darker)
+    (method,) = methods.parse("isotropic/default")
+    stage = stage_of(world)
+    images = np.array([runs.run(stage, method, 0.1, seed, [1.0]).images[0] for seed in range(5)])
+    weight = metrics.weights(ref.halves)
+    mask = np.ones(weight.shape[:2], bool)
+    energy = metrics.energy(images, ref.halves, mask)
+    bias2 = metrics.estimate(metrics.bias2, metrics.products(images, ref.halves, mask, weight))
+    print(energy, bias2)
+    assert energy.excludes(1) == (dark < 1)
+    if dark < 1:
+        assert energy.high < 0.98 and bias2.low > 5e-4
+    else:
+        assert energy.value == pytest.approx(1, abs=0.005) and bias2.value < 5e-4
+
+
+def test_looking_at_pictures_does_not_cost_time(monkeypatch):
+    """What the report does with a picture is not on the clock of the method."""
+    import time
+
+    world = mi.load_dict(room(size=16))
+    (method,) = methods.parse("isotropic/default")
+    stage = stage_of(world, 2000)
+    runs.run(stage, method, 0.1, 0, [0.2])
+    add = runs._Recorder.add
+
+    def slow(*arguments):
+        time.sleep(0.05)
+        return add(*arguments)
+
+    swift = runs.run(stage, method, 0.1, 1, [0.2, 0.4])
+    monkeypatch.setattr(runs._Recorder, "add", slow)
+    found = runs.run(stage, method, 0.1, 1, [0.2, 0.4])
+    # A sleep of 50 ms a pass would leave 8 of them.
+    assert found.passes[1] > max(12, 0.4 * swift.passes[1])
+    assert sum(found.stages.values()) == pytest.approx(found.seconds[1])
+
+
+def test_pictures_are_snapshots_of_one_run():
+    world = mi.load_dict(room(size=16))
+    for name in ("path", "isotropic/default"):
+        (method,) = methods.parse(name)
+        stage = stage_of(world, 2000)
+        runs.warm_up(stage, method, 0.1, 9)
+        found = runs.run(stage, method, 0.1, 0, [1e-6, 0.3, 0.6])
+        assert found.passes[0] == 0 and np.isnan(found.images[0]).all()
+        assert 0 < found.passes[1] < found.passes[2] and found.spp[1] < found.spp[2]
+        assert found.seconds[1] <= 0.3 and 0.3 < found.seconds[2] <= 0.6
+        assert np.isfinite(found.images[1:]).all()
+
+
+def test_path_in_calls_is_path():
+    """Calls of several sizes are weighted by their samples."""
+    world = mi.load_dict(room(size=16))
+    (method,) = methods.parse("path")
+    found = runs.run(stage_of(world), method, None, 0, [1.0])
+    expected = np.array(mi.render(world, integrator=mi.load_dict({"type": "path"}), spp=2048))
+    assert found.images[0].mean() == pytest.approx(expected.mean(), rel=0.01)
+
+
+def test_regions_lie_where_plate_and_caustic_are():
+    def found(dictionary):
+        world = mi.load_dict(dictionary)
+        sensor = world.sensors()[0]
+        image = np.array(mi.render(world, integrator=mi.load_dict({"type": "path"}), spp=64))
+        return regions.find(prepare(world, Settings(), False), sensor, image, 0), world
+
+    plate, world = found(room_with_plate(48))
+    from energy import regions as shapes
+
+    seen = shapes(world)["plate"]
+    overlap = (plate["anisotropic"] & seen).sum()
+    assert overlap > 0.9 * seen.sum() and overlap > 0.9 * plate["anisotropic"].sum()
+
+    ball, world = found(room_with_ball(48))
+    assert "anisotropic" not in ball
+    # Below the ball, seen past it and through it.
+    assert ball["caustic"].sum() < 150
+    assert ball["caustic"][36:46, 20:34].mean() > 0.2
+    assert set(found(room(size=48))[0]) == {"whole"}

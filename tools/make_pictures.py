@@ -1,0 +1,126 @@
+"""Make ``scenes/pictures``: ``python tools/make_pictures.py comparison bars gallery``.
+
+comparison  teapot and pan as the scenes have them, with both kernels, beside their references.
+bars        the same of the brushed wall, with few photons and few eye samples.
+gallery     all references.
+
+Prints what it measures. Needs matplotlib, which the extra ``dev`` brings.
+"""
+
+import argparse
+from pathlib import Path
+
+import aniso_pm  # noqa: F401
+import mitsuba as mi
+import numpy as np
+from aniso_pm.report import reference as references
+from aniso_pm.report.reference import relative_rmse
+
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
+# The close-up of each scene: left, top, right, bottom in pixels.
+CLOSE_UPS = {"teapot": (165, 230, 325, 350), "fry_pan": (60, 90, 260, 240)}
+
+
+def render(scene, integrator, spp, seed):
+    plugin = mi.load_dict(integrator)
+    image = np.array(mi.render(scene, integrator=plugin, spp=spp, seed=seed), dtype=np.float64)
+    return image[..., :3], plugin
+
+
+def srgb(image):
+    low = 12.92 * image
+    return np.clip(
+        np.where(image < 0.0031308, low, 1.055 * np.maximum(image, 1e-9) ** (1 / 2.4) - 0.055), 0, 1
+    )
+
+
+def comparison():
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(
+        4, 3, figsize=(12, 13.4), height_ratios=[3, 2.25, 3, 2.25], dpi=100, facecolor="white"
+    )
+    for row, name in enumerate(CLOSE_UPS):
+        scene = mi.load_file(str(SCENES / f"{name}.xml"))
+        compared = references.read(SCENES / "references" / f"{name}.exr")
+        reference = compared.mean
+        columns = []
+        for kernel in ("isotropic", "anisotropic"):
+            parameters = scene.integrator().parameters() | {"type": "aniso_pm", "kernel": kernel}
+            image, plugin = render(scene, parameters, 0, 1)
+            error = relative_rmse(image - reference, reference)
+            columns.append((f"{kernel}: relative RMSE {100 * error:.1f} %", image))
+            seconds = plugin.statistics["seconds"]
+            print(
+                f"{name} {kernel}: relative RMSE {error:.4f}, mean-energy ratio "
+                f"{image.mean() / reference.mean():.4f}, {sum(seconds.values()):.1f} s, "
+                f"radius {plugin.statistics['initial_radius']:.3f}"
+            )
+            if kernel == "anisotropic":
+                picture = SCENES / "pictures" / f"{name}.png"
+                mi.util.write_bitmap(str(picture), mi.TensorXf(image.astype(np.float32)))
+        own = compared.own_error
+        columns.append((f"path, reference (own error {100 * own:.1f} %)", reference))
+        print(f"{name}: error of the reference itself {own:.4f}")
+        left, top, right, bottom = CLOSE_UPS[name]
+        for column, (title, image) in enumerate(columns):
+            shown = srgb(image)
+            axes[2 * row, column].imshow(shown)
+            axes[2 * row, column].set_title(title, fontsize=11)
+            axes[2 * row + 1, column].imshow(shown[top:bottom, left:right], interpolation="nearest")
+    for ax in axes.flat:
+        ax.set_axis_off()
+    figure.tight_layout(pad=0.4)
+    figure.savefig(SCENES / "pictures" / "comparison.png", dpi=100, pil_kwargs={"optimize": True})
+
+
+def bars():
+    """One row: isotropic, anisotropic, reference; both kernels with the same photons and paths."""
+    from matplotlib import pyplot as plt
+
+    scene = mi.load_file(str(SCENES / "brushed_wall.xml"))
+    compared = references.read(SCENES / "references" / "brushed_wall.exr")
+    columns = []
+    for kernel in ("isotropic", "anisotropic"):
+        parameters = {"type": "aniso_pm", "kernel": kernel, "passes": 4, "photon_count": 250_000}
+        image, plugin = render(scene, parameters, 16, 1)
+        error = relative_rmse(image - compared.mean, compared.mean)
+        energy = image.mean() / compared.mean.mean()
+        print(f"brushed_wall {kernel}: relative RMSE {error:.4f}, mean-energy ratio {energy:.4f}")
+        columns.append((f"{kernel}: relative RMSE {100 * error:.1f} %", image))
+    own = compared.own_error
+    columns.append((f"path, reference (own error {100 * own:.1f} %)", compared.mean))
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.4), dpi=100, facecolor="white")
+    for ax, (title, image) in zip(axes, columns, strict=True):
+        ax.imshow(srgb(2.5 * image), interpolation="nearest")
+        ax.set_title(title, fontsize=11)
+        ax.set_axis_off()
+    figure.tight_layout(pad=0.4)
+    figure.savefig(SCENES / "pictures" / "bars.png", dpi=100, pil_kwargs={"optimize": True})
+
+
+def gallery():
+    """All references of 160 x 120 pixels, each as bright as its brightest twentieth allows."""
+    from matplotlib import pyplot as plt
+
+    found = {}
+    for path in sorted((SCENES / "references").glob("*.exr")):
+        reference = references.read(path)
+        if reference.mean.shape == (120, 160, 3):
+            found[path.stem.removesuffix("_160x120")] = reference
+    figure, axes = plt.subplots(2, 3, figsize=(9.6, 5.3), dpi=100, facecolor="white")
+    for ax, (name, reference) in zip(axes.flat, found.items(), strict=True):
+        ax.imshow(srgb(0.8 * reference.mean / np.percentile(reference.mean, 95)))
+        ax.set_title(f"{name} (own error {100 * reference.own_error:.1f} %)", fontsize=10)
+        ax.set_axis_off()
+    figure.tight_layout(pad=0.4)
+    figure.savefig(SCENES / "pictures" / "gallery.png", dpi=100, pil_kwargs={"optimize": True})
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    makers = {maker.__name__: maker for maker in (comparison, bars, gallery)}
+    parser.add_argument("what", nargs="+", choices=list(makers))
+    mi.set_variant("llvm_ad_rgb")
+    for name in parser.parse_args().what:
+        makers[name]()
