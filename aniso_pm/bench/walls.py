@@ -83,7 +83,9 @@ def uneven_radii(photons: int) -> tuple[float, float]:
     """The same of ``uneven``: in the crowd's square, outside it."""
     inside = CROWD * photons / CROWD_AREA
     outside = (1 - CROWD) * photons / (WALLS - CROWD_AREA)
-    return tuple(float(np.sqrt(PER_QUERY / (np.pi * density))) for density in (inside, outside))
+    return float(np.sqrt(PER_QUERY / (np.pi * inside))), float(
+        np.sqrt(PER_QUERY / (np.pi * outside))
+    )
 
 
 def ellipses(rng, places: Places, cut_radius, aspect: float) -> Ellipses:
