@@ -43,7 +43,7 @@ def _map_rows(found: dict[str, Any]) -> Iterator[Row]:
         None if on_gpu else target,
         f"resident memory, above that before; diffuse room, {stored} photons, second of two maps "
         f"(room for them known); at rest {found['at_rest']:.0f} B; peak of the first map "
-        f"{found['first'] / stored:.1f} B",
+        f"{found['first'] / stored:.1f} B; every block takes whole pages, where huge ones of 2 MB",
     )
     yield Row(
         "memory: the same by Dr.Jit's allocator, blocks rounded up to powers of two",
@@ -135,7 +135,8 @@ def large_memory() -> dict[str, Any]:
     }
     integrator = mi.load_dict(integrator)
     began = time.perf_counter()
-    dr.eval(mi.render(scene, integrator=integrator, spp=1))
+    # Not mi.render(): it hides errors.
+    dr.eval(integrator.render(scene, sensor=scene.sensors()[0], seed=0, spp=1))
     dr.sync_thread()
     return {
         "resident": _resident("VmHWM"),
