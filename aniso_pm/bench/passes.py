@@ -57,11 +57,18 @@ def measure(quick: bool) -> Iterator[Row]:
             ("<=", BOUND) if counted else None,
             f"{share:.0%} of the gathers anisotropic, {photons_each:.0f} photons a gather, "
             f"{size}×{size}, {spp} spp, {photons:g} light paths, best of {repetitions}: "
-            f"anisotropic {times['anisotropic']}, isotropic {times['isotropic']}"
-            + ("" if counted else "; too few to count"),
+            f"anisotropic {times['anisotropic']}, isotropic {times['isotropic']}; "
+            f"{_stages(*integrators.values())}" + ("" if counted else "; too few to count"),
         )
         yield row
         rows += [row] if counted else []
     if rows:
         worst = max(rows, key=lambda row: row.figure)
         yield Row("pass: the worst of these scenes", worst.figure, "×", ("<=", BOUND), worst.name)
+
+
+def _stages(anisotropic, isotropic) -> str:
+    """Where the time of the last repetition went."""
+    a, b = (integrator.statistics["seconds"] for integrator in (anisotropic, isotropic))
+    stages = (s for s in a if s in b and max(a[s], b[s]) > 0.01)
+    return ", ".join(f"{s} {1000 * a[s]:.0f} and {1000 * b[s]:.0f} ms" for s in stages)
