@@ -58,8 +58,8 @@ def measure(quick: bool) -> Iterator[Row]:
             ("<=", BOUND) if counted else None,
             f"{share:.0%} of the gathers anisotropic, {photons_each:.0f} photons a gather, "
             f"{size}×{size}, {spp} spp, {photons:g} light paths, best of {repetitions}: "
-            f"anisotropic {times['anisotropic']}, isotropic {times['isotropic']}"
-            + ("" if counted else "; too few to count"),
+            f"anisotropic {times['anisotropic']}, isotropic {times['isotropic']}; "
+            f"{_stages(*integrators.values())}" + ("" if counted else "; too few to count"),
         )
         yield row
         rows += [row] if counted else []
@@ -70,3 +70,10 @@ def measure(quick: bool) -> Iterator[Row]:
 
 def _seconds(scene, integrator, spp: int) -> float:
     return run(lambda: mi.render(scene, integrator=integrator, spp=spp))
+
+
+def _stages(anisotropic, isotropic) -> str:
+    """Where the time of the last repetition went."""
+    a, b = (integrator.statistics["seconds"] for integrator in (anisotropic, isotropic))
+    stages = (s for s in a if s in b and max(a[s], b[s]) > 0.01)
+    return ", ".join(f"{s} {1000 * a[s]:.0f} and {1000 * b[s]:.0f} ms" for s in stages)
