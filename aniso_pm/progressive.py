@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -19,23 +18,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import digest, memory, state
+from . import advice, digest, memory, state
 from . import film as films
 from .accumulate import Sums, mean_and_variance, relative_standard_error
+from .clock import Clock
 from .errors import is_interrupt
-from .pilot import LARGEST, photons_per_path, settle
+from .pilot import photons_per_path, settle
 from .prepared import EYE, PROBE, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
 from .stopping import Stopping
 
 # Eye samples traced at once, where there is memory for them (see ``memory``).
 WAVEFRONT = 1 << 21
-# Passes that make the colours of a spectral picture right within about a percent.
-_SPECTRAL_PASSES = 16
-# Anisotropic meshes without texture coordinates that warnings name.
-_NAMED = 3
-# Photons in the mean kernel below which a radius that was given cannot be meant.
-_FEWEST_IN_KERNEL = 0.1
 # What a pass counts.
 _COUNTS = (
     "photons_emitted",
@@ -104,8 +98,7 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
     finally:
         run.stopping.close()
     run.finish()
-    _warn(statistics)
-    _warn_about_radius(scene, statistics)
+    advice.after(scene, statistics)
     return Rendered(run.map, run.radius, run.variance)
 
 
@@ -141,7 +134,7 @@ class _Run:
         pixels = films.pixel_count(self.film)
         self.shares = shares(scene.settings, spp, pixels, controls.first_pass)
         self.stopping = Stopping(scene.settings)
-        self.clock = _Clock()
+        self.clock = Clock()
         self.map = self.radius = self.variance = None
         self.done = _Done(None, [], dict.fromkeys((*_COUNTS, "passes"), 0))
         self.photons, self.points = _Room(), _Room()
@@ -151,26 +144,7 @@ class _Run:
 
     def start(self):
         """Pilot, or the state of an earlier run."""
-        if not self.scene.scene.emitters():
-            mi.Log(
-                mi.LogLevel.Warn,
-                "aniso_pm: the scene has no emitters; the picture will be black. Add one, or give "
-                'a shape the emitter "area"',
-            )
-        for surface in self.scene.needs.grainless[:_NAMED]:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f'aniso_pm: the mesh "{surface}" is anisotropic but has no texture coordinates: '
-                "its grooves run along the first edge of every triangle. Give it texture "
-                "coordinates (u along the grooves' alpha_u)",
-            )
-        passes = self.scene.settings.passes
-        if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f"aniso_pm: all light of a pass shares four wavelengths; {passes} passes will give "
-                f'wrong colours, set the parameter "passes" to {_SPECTRAL_PASSES} or more',
-            )
+        advice.before(self.scene)
         self.film.prepare([])
         settings, checkpoint = self.scene.settings, self.controls.checkpoint
         earlier = checkpoint.start() if checkpoint else None
@@ -452,57 +426,3 @@ class _Run:
             self._estimate_error()
             if self.controls.checkpoint:
                 self.controls.checkpoint.write(self._state())
-
-
-def _warn(statistics):
-    emitted = statistics["photons_emitted"]
-    if statistics["photons_rejected"] > 1e-3 * emitted:
-        mi.Log(
-            mi.LogLevel.Warn,
-            f"aniso_pm: {statistics['photons_rejected']} times in {emitted} light paths a flux was "
-            "not finite and was dropped; an emitter or a BSDF returns NaN or infinity",
-        )
-    if statistics["eye_samples_rejected"]:
-        mi.Log(
-            mi.LogLevel.Warn,
-            f"aniso_pm: {statistics['eye_samples_rejected']} of {statistics['eye_samples']} eye "
-            "samples were not finite and count as black",
-        )
-
-
-def _warn_about_radius(scene, statistics):
-    """A radius that somebody has chosen may be right in other units."""
-    radius, points = scene.settings.initial_radius, statistics["gather_points"]
-    if not radius or not points or not statistics["photons_stored"]:
-        return
-    mean = statistics["photons_gathered"] / points
-    wrong = None
-    if mean < _FEWEST_IN_KERNEL:
-        wrong = f"kernels hold {mean:.2g} photons in the mean, the rest is noise"
-    elif radius > LARGEST * scene.extent:
-        wrong = "kernels reach across much of it and blur everything"
-    if wrong:
-        mi.Log(
-            mi.LogLevel.Warn,
-            f'aniso_pm: parameter "initial_radius" is {radius:g} in a scene that is '
-            f"{scene.extent:.3g} large: {wrong}. Lengths are in world units; 0 is automatic",
-        )
-
-
-class _Clock:
-    """Wall-clock time of each stage; a lap ends when the work handed to Dr.Jit is done."""
-
-    def __init__(self):
-        self.seconds: dict[str, float] = {}
-        self.last = time.perf_counter()
-
-    def go_on_from(self, seconds: dict[str, float]):
-        """Count on from an earlier run."""
-        for stage, spent in seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
-
-    def lap(self, stage: str):
-        dr.sync_thread()
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
-        self.last = now

@@ -1,0 +1,78 @@
+"""Warnings about what a scene or its parameters will do, or have done, to the picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from .pilot import LARGEST
+from .prepared import Prepared
+
+# Passes that make the colours of a spectral picture right within about a percent.
+_SPECTRAL_PASSES = 16
+# Anisotropic meshes without texture coordinates that warnings name.
+_NAMED = 3
+# Photons in the mean kernel below which a radius that was given cannot be meant.
+_FEWEST_IN_KERNEL = 0.1
+
+
+def before(scene: Prepared) -> None:
+    """Of what can be seen without rendering."""
+    if not scene.scene.emitters():
+        mi.Log(
+            mi.LogLevel.Warn,
+            "aniso_pm: the scene has no emitters; the picture will be black. Add one, or give "
+            'a shape the emitter "area"',
+        )
+    for surface in scene.needs.grainless[:_NAMED]:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'aniso_pm: the mesh "{surface}" is anisotropic but has no texture coordinates: '
+            "its grooves run along the first edge of every triangle. Give it texture "
+            "coordinates (u along the grooves' alpha_u)",
+        )
+    passes = scene.settings.passes
+    if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"aniso_pm: all light of a pass shares four wavelengths; {passes} passes will give "
+            f'wrong colours, set the parameter "passes" to {_SPECTRAL_PASSES} or more',
+        )
+
+
+def after(scene: Prepared, statistics: dict[str, Any]) -> None:
+    """Of what the statistics of a rendering tell."""
+    emitted = statistics["photons_emitted"]
+    if statistics["photons_rejected"] > 1e-3 * emitted:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"aniso_pm: {statistics['photons_rejected']} times in {emitted} light paths a flux was "
+            "not finite and was dropped; an emitter or a BSDF returns NaN or infinity",
+        )
+    if statistics["eye_samples_rejected"]:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"aniso_pm: {statistics['eye_samples_rejected']} of {statistics['eye_samples']} eye "
+            "samples were not finite and count as black",
+        )
+    _radius(scene, statistics)
+
+
+def _radius(scene, statistics):
+    """A radius that somebody has chosen may be right in other units."""
+    radius, points = scene.settings.initial_radius, statistics["gather_points"]
+    if not radius or not points or not statistics["photons_stored"]:
+        return
+    mean = statistics["photons_gathered"] / points
+    wrong = None
+    if mean < _FEWEST_IN_KERNEL:
+        wrong = f"kernels hold {mean:.2g} photons in the mean, the rest is noise"
+    elif radius > LARGEST * scene.extent:
+        wrong = "kernels reach across much of it and blur everything"
+    if wrong:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'aniso_pm: parameter "initial_radius" is {radius:g} in a scene that is '
+            f"{scene.extent:.3g} large: {wrong}. Lengths are in world units; 0 is automatic",
+        )
