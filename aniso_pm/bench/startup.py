@@ -25,7 +25,7 @@ def _imports(repetitions: int) -> Row:
     """Both in processes of their own; set_variant counts, because that is when plugins are made."""
     select = f"import mitsuba as mi; mi.set_variant('{mi.variant()}')"
     codes = {"without": select, "with": f"import aniso_pm; {select}"}
-    seconds = {name: [] for name in codes}
+    seconds: dict[str, list[float]] = {name: [] for name in codes}
     for _ in range(1 + repetitions):
         for name, code in codes.items():
             began = time.perf_counter()

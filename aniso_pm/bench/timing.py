@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,7 +40,7 @@ def run(task: Callable[[], Any]) -> float:
     return time.perf_counter() - began
 
 
-def interleaved(tasks: dict[str, Callable[[], float]], repetitions: int) -> dict[str, Times]:
+def interleaved(tasks: Mapping[Any, Callable[[], float]], repetitions: int) -> dict[Any, Times]:
     """Seconds of each task, in rounds: each task once, then each once again.
 
     A task returns its own seconds (see ``run``). One round before the first is not counted: in it
