@@ -115,7 +115,8 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     launch    ``eye_paths``, or that function frozen.
     """
     if not options.gathers:
-        L, valid, _, _ = (launch or eye_paths)(scene, sampler, ray, options, None, None, None)
+        launch = launch or eye_paths
+        L, valid, _, _ = launch(scene, sampler.clone(), ray, options, None, None, None)
         dr.eval(L, valid)
         return L, valid, None
     # Without mixed receivers a path ends where it leaves its first gather point.

@@ -15,12 +15,13 @@ def pixel_count(film) -> int:
     return width * height
 
 
-def sample_rays(sensor, sampler, spp, wavelength, first, pixels):
+def sample_rays(sensor, sampler, spp, wavelength, first=0, pixels=None):
     """Camera rays of one wavefront: (ray, weight, position on the film), spp samples a pixel in
-    consecutive lanes. first, pixels: which of them, row by row. wavelength: the
-    sample in [0, 1) that chooses wavelengths for all of them."""
+    consecutive lanes. wavelength: the sample in [0, 1) that chooses wavelengths
+    for all of them. first, pixels: of which pixels, row by row; None: all from the first on."""
     film = sensor.film()
-    width, _ = _sampled_size(film)
+    width, height = _sampled_size(film)
+    pixels = width * height - first if pixels is None else pixels
     lane = dr.arange(mi.UInt32, pixels * spp)
     pixel = lane // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first)
     row = pixel // width

@@ -31,7 +31,7 @@ _SHARE = 0.75
 # --- Bytes, measured (see above) ---
 _FIXED = 32 << 20  # compiled kernels
 _LIGHT_PATH = 24  # in flight: random numbers, emitter sample
-_PHOTON = 140  # while the index is built: buffers, sorted copies, keys (16 of them flux)
+_PHOTON = 62  # while the index is built: buffers, sorted copies, keys (16 of them flux)
 _PHOTON_SUMMED = 22  # with gather_tolerance: its share of the sums over nodes
 _EYE_SAMPLE = 70  # in flight: ray, random numbers, radiance
 _POINT = 100  # gather point: columns, sorted copies, result (12 of them throughput)
@@ -74,7 +74,7 @@ class Plan:
         scene, job = self.scene, self.job
         flux, general = photons.flux_bytes(), bool(scene.needs.general)
         summed = scene.settings.gather_tolerance > 0
-        per_photon = _PHOTON + 2 * (flux - 16) + general * 8 + summed * _PHOTON_SUMMED
+        per_photon = _PHOTON + (flux - 16) + general * 8 + summed * _PHOTON_SUMMED
         per_point = _POINT + scene.follow_lobes * _POINT_LOBE + general * _POINT_GENERAL
         per_sample = _EYE_SAMPLE + _points_per_sample(scene) * (per_point + 2 * (flux - 16))
         paths = min(self.light_paths, scene.settings.photon_count) if scene.needs_map else 0
@@ -101,7 +101,7 @@ def _points_per_sample(scene: Prepared) -> float:
     if not scene.needs_map:
         return 0
     if scene.use == "caustic":
-        return 4.5
+        return 6  # 4 and buffers that grew
     return 2 if scene.use == "final_gather" else 1 + 0.2 * bool(scene.needs.general)
 
 
@@ -125,8 +125,10 @@ def plan(scene: Prepared, job: Job, count_photons: Callable[[], float]) -> Plan:
         large = [f for f in flights if flights[f] and getattr(result, f) > SMALLEST]
         if not large:
             raise Unsupported(_refusal(result, said))
-        name = max(large, key=flights.get)
-        result = replace(result, **{name: _half(getattr(result, name))})
+        if max(large, key=lambda f: flights[f]) == "light_paths":
+            result = replace(result, light_paths=_half(result.light_paths))
+        else:
+            result = replace(result, eye_samples=_half(result.eye_samples))
     return result
 
 
@@ -141,11 +143,11 @@ def _refusal(plan: Plan, said: str) -> str:
     shown = {f"the film of {job.pixels} pixels": parts["film"], "the smallest wavefronts": flights}
     if job.stored:
         shown = {f"a map of {job.stored:.2g} photons": parts["photons"]} | shown
-    shown = ", ".join(f"{_gib(size)} for {what}" for what, size in shown.items())
+    each = ", ".join(f"{_gib(size)} for {what}" for what, size in shown.items())
     remedy = '"photon_count"' if parts["photons"] > parts["film"] else "the size of the film"
     return (
         f'aniso_pm: parameter "max_memory" is {said}, but rendering takes about '
-        f"{_gib(plan.bytes)} GiB ({shown}); lower {remedy} or give a larger max_memory"
+        f"{_gib(plan.bytes)} GiB ({each}); lower {remedy} or give a larger max_memory"
     )
 
 
@@ -185,13 +187,14 @@ def cgroup_available(root: Path = Path("/")) -> float:
     for line in groups:
         _, controllers, path = line.split(":", 2)
         if controllers == "":
-            top, names = "sys/fs/cgroup", ("memory.max", "memory.current", "inactive_file")
+            top = root / "sys/fs/cgroup"
+            names = "memory.max", "memory.current", "inactive_file"
         elif "memory" in controllers.split(","):
-            top = "sys/fs/cgroup/memory"
+            top = root / "sys/fs/cgroup/memory"
             names = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
         else:
             continue
-        top, group = root / top, root / top / path.lstrip("/")
+        group = top / path.lstrip("/")
         # A limit may be that of any group around this one. Inside a container the path may be one
         # that only the host knows.
         for directory in (group, *group.parents):

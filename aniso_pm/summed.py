@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -92,8 +93,8 @@ def _leaves(map_: photons.PhotonMap) -> _Node:
     index = map_.index
     count = dr.opaque(mi.UInt32, index.count)
     first = LEAF * dr.arange(mi.UInt32, index.n_leaves)
-    leaf = None
-    for k in range(LEAF):
+
+    def photon(k: int) -> _Node:
         exists = first + k < count
         slot = dr.minimum(first + k, count - 1)
         point = dr.gather(mi.Vector4f, index.points, slot)
@@ -101,19 +102,22 @@ def _leaves(map_: photons.PhotonMap) -> _Node:
         normal = photons.decode_normal(word)
         # The last photon, again and again without flux, fills up what does not exist.
         flux = dr.select(exists, photons.photon_flux(map_, slot, True), 0)
-        place = (mi.Spectrum(c) for c in (point.x, point.y, point.z))
+        x, y, z = (mi.Spectrum(c) for c in (point.x, point.y, point.z))
         steps, caustic = photons.segments(word), photons.is_caustic(word)
-        one = _Node(flux, *place, normal, normal, steps, caustic)
-        leaf = one if leaf is None else _joined(leaf, one)
-    return leaf
+        return _Node(flux, x, y, z, normal, normal, steps, caustic)
+
+    return reduce(_joined, map(photon, range(LEAF)))
 
 
 def _joined(a: _Node, b: _Node) -> _Node:
     flux = a.flux + b.flux
     share = dr.select(flux > 0, b.flux / flux, 0.5)
+    x, y, z = (u + (v - u) * share for u, v in ((a.x, b.x), (a.y, b.y), (a.z, b.z)))
     return _Node(
         flux,
-        *(u + (v - u) * share for u, v in ((a.x, b.x), (a.y, b.y), (a.z, b.z))),
+        x,
+        y,
+        z,
         dr.minimum(a.low, b.low),
         dr.maximum(a.high, b.high),
         dr.maximum(a.segments, b.segments),

@@ -63,6 +63,9 @@ class AnisoPhotonMapper:
        - ``global``: all indirect light is read from the photon map at the first receiver.
          ``caustic``: the map holds only light that reached a receiver over glass, mirrors and
          glossy surfaces; the rest is path traced, and scenes without caustics have no map.
+         ``auto``: ``global`` if the scene has surfaces that light is traced over (glass, mirrors,
+         smooth or coated metal) or lights that only photons find; else no map and no photons, as
+         ``caustic`` does there. ``statistics["map"]`` tells which it was, or "none".
          (Default: ``global``)
 
      * - final_gather
@@ -136,6 +139,14 @@ class AnisoPhotonMapper:
      * - rr_depth
        - |int|
        - Path depth at which Russian roulette begins, for eye and light paths alike. (Default: 5)
+
+     * - max_memory
+       - |float|
+       - Memory in GiB that rendering may take beyond what the process holds before. Light paths
+         and eye samples are traced in smaller wavefronts where it would be exceeded, which changes
+         random numbers but nothing in the mean; what does not fit even so is refused before the
+         first pass. An estimate: the peak may be half as much again. 0 takes three quarters of what
+         is available, to this process's control group or on the CUDA device. (Default: 0)
 
      * - hide_emitters
        - |bool|

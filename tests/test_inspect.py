@@ -38,6 +38,15 @@ def test_without_caustics_a_caustic_map_is_no_map():
     assert integrator.statistics["photons_emitted"] == 0
 
 
+def test_auto_says_what_it_chose_and_why():
+    none = findings("area, diffuse", map="auto")["photon map"]
+    assert not none.needed and none.evidence[0] == "map=auto: nothing casts caustics"
+    found = findings("brushed conductor", map="auto")["photon map"]
+    assert found.needed and found.consequence.startswith("global")
+    assert found.evidence[0] == "map=auto: light over plate: TwoSidedBRDF(RoughConductor)"
+    assert "map=auto" not in str(findings("brushed conductor")["photon map"].evidence)
+
+
 def test_what_is_gathered_as_a_whole_casts_no_caustics():
     bumped = matrix.rows()["tilted diffuse floor under a spot"]
     scene = matrix.make(bumped, size=4)

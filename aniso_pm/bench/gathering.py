@@ -7,8 +7,9 @@ as the integrator does: the time for that is counted. Flux is gathered and weigh
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +25,7 @@ ASPECTS = {1: 1.0, 16: 0.85, 64: 0.6}
 
 def measure(quick: bool) -> Iterator[Row]:
     photons, queries, repetitions = (200_000, 50_000, 3) if quick else (1_000_000, 250_000, 7)
-    speed: dict[int | str, float] = {}
+    speed: dict[Any, float] = {}
     yield from _even(photons, queries, repetitions, speed)
     yield from _uneven(photons, queries, repetitions, speed)
 
@@ -49,13 +50,14 @@ def _even(photons, queries, repetitions, speed) -> Iterator[Row]:
     visit, zero = walls.visitor(flux)
     ellipses = {aspect: walls.ellipses(rng, at, radius, aspect) for aspect in ASPECTS}
 
-    tasks: dict[int | str, Callable[[], float]] = {
-        aspect: partial(run, partial(_ours, index, e, visit, zero))
-        for aspect, e in ellipses.items()
-    }
-    for name, rows in (("grid", False), ("rows", True)):
-        rival = partial(grid.gather, cells, ellipses[1], walls.CUT2, visit, zero, rows)
-        tasks[name] = partial(run, rival)
+    def ours(e) -> float:
+        return run(lambda: _ours(index, e, visit, zero))
+
+    def gridded(rows: bool) -> float:
+        return run(lambda: grid.gather(cells, ellipses[1], walls.CUT2, visit, zero, rows))
+
+    tasks: dict[Any, Any] = {aspect: partial(ours, e) for aspect, e in ellipses.items()}
+    tasks |= {"grid": partial(gridded, False), "rows": partial(gridded, True)}
     # The tree is slow: few queries tell its speed.
     few = min(queries, 20_000)
     tree = _scipy_tree(places.position)
