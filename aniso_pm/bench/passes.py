@@ -42,7 +42,10 @@ def measure(quick: bool) -> Iterator[Row]:
             )
             for kernel in ("anisotropic", "isotropic")
         }
-        tasks = {kernel: partial(_render, scene, i, spp) for kernel, i in integrators.items()}
+        tasks = {
+            kernel: partial(_seconds, scene, integrator, spp)
+            for kernel, integrator in integrators.items()
+        }
         times = interleaved(tasks, repetitions)
         found = integrators["anisotropic"].statistics
         share = found["gather_points_anisotropic"] / max(1, found["gather_points"])
@@ -61,11 +64,11 @@ def measure(quick: bool) -> Iterator[Row]:
         yield row
         rows += [row] if counted else []
     if rows:
-        worst = max(rows, key=lambda row: row.figure or 0.0)
+        worst = max(rows, key=lambda row: row.figure or 0)
         yield Row("pass: the worst of these scenes", worst.figure, "×", ("<=", BOUND), worst.name)
 
 
-def _render(scene, integrator, spp: int) -> float:
+def _seconds(scene, integrator, spp: int) -> float:
     return run(lambda: mi.render(scene, integrator=integrator, spp=spp))
 
 
