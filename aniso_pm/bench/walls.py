@@ -76,16 +76,18 @@ def _on_walls(uv, wall) -> Places:
 
 def even_radius(photons: int) -> float:
     """Radius of the disc that holds PER_QUERY photons of ``even``: where discs are cut."""
-    return float(np.sqrt(PER_QUERY * WALLS / (np.pi * photons)))
+    return _radius(photons / WALLS)
 
 
 def uneven_radii(photons: int) -> tuple[float, float]:
     """The same of ``uneven``: in the crowd's square, outside it."""
     inside = CROWD * photons / CROWD_AREA
     outside = (1 - CROWD) * photons / (WALLS - CROWD_AREA)
-    return float(np.sqrt(PER_QUERY / (np.pi * inside))), float(
-        np.sqrt(PER_QUERY / (np.pi * outside))
-    )
+    return _radius(inside), _radius(outside)
+
+
+def _radius(density: float) -> float:
+    return float(np.sqrt(PER_QUERY / (np.pi * density)))
 
 
 def ellipses(rng, places: Places, cut_radius, aspect: float) -> Ellipses:
