@@ -77,9 +77,10 @@ def test_the_path_is_told_vertex_by_vertex():
     assert found.lobe.distance == pytest.approx(np.linalg.norm(step), rel=1e-4)
 
 
-@pytest.mark.parametrize("map_", ["global", "caustic"])
-def test_photons_inside_are_those_that_geometry_puts_there(map_):
-    found = explained(room_with_plate(16), (7, 12), map=map_, photon_count=60_000)
+@pytest.mark.parametrize("map_, tolerance", [("global", 0.0), ("global", 0.9), ("caustic", 0.0)])
+def test_photons_inside_are_those_that_geometry_puts_there(map_, tolerance):
+    options = {"map": map_, "gather_tolerance": tolerance, "photon_count": 60_000}
+    found = explained(room_with_plate(16), (7, 12), **options)
     photons, kernel = found.photons, found.kernel
     long, short = np.linalg.norm(kernel.s), np.linalg.norm(kernel.t)
     rho2 = (photons.xy[:, 0] / long) ** 2 + (photons.xy[:, 1] / short) ** 2

@@ -69,7 +69,8 @@ def explain(
     each = shares(settings, spp, pixels).each
     wanted = settings.photon_count or None, settings.initial_radius or None
     count, radius0 = settle(prepared, sensor, seed, each * pixels, *wanted)
-    prepared = prepared.with_(photon_count=count)
+    # Photon by photon, so that those that are shown are those that are summed.
+    prepared = prepared.with_(photon_count=count, gather_tolerance=0.0)
     radius = bandwidth(radius0, settings.alpha, pass_index)
     colour = wavelength_sample(seed, pass_index)
     wavelengths = film.wavelengths(sensor, colour) if mi.is_spectral else None
