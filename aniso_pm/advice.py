@@ -32,6 +32,7 @@ def before(scene: Prepared) -> None:
             "its grooves run along the first edge of every triangle. Give it texture "
             "coordinates (u along the grooves' alpha_u)",
         )
+    _large_radius(scene)
     passes = scene.settings.passes
     if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
         mi.Log(
@@ -56,23 +57,25 @@ def after(scene: Prepared, statistics: dict[str, Any]) -> None:
             f"aniso_pm: {statistics['eye_samples_rejected']} of {statistics['eye_samples']} eye "
             "samples were not finite and count as black",
         )
-    _radius(scene, statistics)
+    points = statistics["gather_points"]
+    if scene.settings.initial_radius and points and statistics["photons_stored"]:
+        mean = statistics["photons_gathered"] / points
+        if mean < _FEWEST_IN_KERNEL:
+            _warn_of_radius(
+                scene, f"kernels hold {mean:.2g} photons in the mean, the rest is noise"
+            )
 
 
-def _radius(scene, statistics):
+def _large_radius(scene):
+    if scene.needs_map and scene.settings.initial_radius > LARGEST * scene.extent:
+        wrong = "kernels reach across much of it, blur everything, and take long to sum"
+        _warn_of_radius(scene, wrong)
+
+
+def _warn_of_radius(scene, wrong):
     """A radius that somebody has chosen may be right in other units."""
-    radius, points = scene.settings.initial_radius, statistics["gather_points"]
-    if not radius or not points or not statistics["photons_stored"]:
-        return
-    mean = statistics["photons_gathered"] / points
-    wrong = None
-    if mean < _FEWEST_IN_KERNEL:
-        wrong = f"kernels hold {mean:.2g} photons in the mean, the rest is noise"
-    elif radius > LARGEST * scene.extent:
-        wrong = "kernels reach across much of it and blur everything"
-    if wrong:
-        mi.Log(
-            mi.LogLevel.Warn,
-            f'aniso_pm: parameter "initial_radius" is {radius:g} in a scene that is '
-            f"{scene.extent:.3g} large: {wrong}. Lengths are in world units; 0 is automatic",
-        )
+    mi.Log(
+        mi.LogLevel.Warn,
+        f'aniso_pm: parameter "initial_radius" is {scene.settings.initial_radius:g} in a scene '
+        f"that is {scene.extent:.3g} large: {wrong}. Lengths are in world units; 0 is automatic",
+    )

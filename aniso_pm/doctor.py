@@ -75,9 +75,11 @@ def examine() -> list[Check]:
     checks.append(Check("LLVM", f"{found['llvm']} ({library})", trouble))
 
     cuda = bool(dr.has_backend(dr.JitBackend.CUDA))
-    device = ".".join(map(str, dr.detail.cuda_version())) if cuda else "none (cuda_* needs one)"
+    device = ".".join(map(str, dr.detail.cuda_version())) if cuda else "no device or driver"
     checks.append(Check("CUDA", device))
-    checks.append(Check("variants", ", ".join(mi.variants())))
+    backends = ("llvm_", "cuda_") if cuda else ("llvm_",)
+    usable = [v for v in mi.variants() if v.startswith(backends) and "polarized" not in v]
+    checks.append(Check("variants", ", ".join(usable) or "none that this integrator can use"))
     checks.append(Check("cores", f"{os.cpu_count()}, {dr.thread_count()} threads used by Dr.Jit"))
 
     for variant in ["llvm_ad_rgb"] + ["cuda_ad_rgb"] * cuda:

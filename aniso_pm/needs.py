@@ -10,6 +10,9 @@ from .emission import only_photons_see
 from .ndf import children, nested_bsdfs, roughness_source
 from .receivers import has_walked_part, is_bent, is_lambertian, may_gather
 
+# Shapes of one BSDF that are named as evidence.
+_NAMED = 4
+
 
 @dataclass(frozen=True)
 class Needs:
@@ -53,6 +56,7 @@ def read_scene(scene, gather_roughness: float) -> Needs:
                 'integrator does not support; remove the medium or use the integrator "volpath"'
             )
     seen = set()
+    names = _sharing(scene)
     for shape in scene.shapes():
         name = shape.id() or shape.class_name()
         if shape.is_medium_transition():
@@ -75,7 +79,7 @@ def read_scene(scene, gather_roughness: float) -> Needs:
         if bsdf.ptr in seen:
             continue
         seen.add(bsdf.ptr)
-        evidence = f"{name}: {describe(bsdf)}"
+        evidence = f"{', '.join(names[bsdf.ptr])}: {describe(bsdf)}"
         if may_gather(bsdf, gather_roughness):
             needs.receivers.append(evidence)
         if is_lambertian(bsdf):
@@ -94,6 +98,19 @@ def read_scene(scene, gather_roughness: float) -> Needs:
         if any(mi.has_flag(bsdf.flags(), flag) for flag in unlit):
             _refuse_unlit(needs, evidence)
     return needs
+
+
+def _sharing(scene) -> dict[int, list[str]]:
+    """Names of the shapes that share a BSDF, by its address."""
+    found: dict[int, list[str]] = {}
+    for shape in scene.shapes():
+        bsdf = None if shape.class_name() == "Instance" else shape.bsdf()
+        if bsdf is not None:
+            found.setdefault(bsdf.ptr, []).append(shape.id() or shape.class_name())
+    for names in found.values():
+        if len(names) > _NAMED:
+            names[_NAMED:] = [f"and {len(names) - _NAMED} more"]
+    return found
 
 
 def _refuse_unlit(needs: Needs, evidence: str):

@@ -43,5 +43,5 @@ def _bind(template: type, base: type) -> type:
 def _refuse_scalar(props):
     raise RuntimeError(
         f'{props.plugin_name()}: the variant "{mi.variant()}" has no Dr.Jit arrays to trace '
-        'photons with; choose a vectorised one, e.g. mi.set_variant("llvm_ad_rgb")'
+        'photons with; choose a vectorised one: mi.set_variant("llvm_ad_rgb"), or -m llvm_ad_rgb'
     )

@@ -127,6 +127,8 @@ def render(
     if as_json:
         record |= {"output": str(out), "png": str(picture) if picture else None}
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
+    elif not quiet:
+        print(_done(record, out, picture))
     if statistics.get("interrupted"):
         print("aniso-pm: interrupted, the picture so far is written", file=sys.stderr)
         return INTERRUPTED
@@ -232,6 +234,20 @@ def _render(world, camera, integrator, seed: int, spp: int | None, quiet: bool) 
         if is_interrupt(error):
             raise InterruptError from error
         raise
+
+
+def _done(record: dict[str, Any], out: Path, picture: Path | None) -> str:
+    """What was rendered, in a line."""
+    statistics = record["statistics"]
+    parts = [f"{record['spp']} samples a pixel"]
+    if statistics.get("passes"):
+        parts.append(f"{statistics['passes']} pass{'es' * (statistics['passes'] > 1)}")
+    if statistics.get("photons_stored"):
+        parts.append(f"kernel radius {statistics['initial_radius']:.3g}")
+    if statistics.get("relative_error"):
+        parts.append(f"standard error {statistics['relative_error']:.1%}")
+    parts.append(f"{record['seconds']['render']:.1f} s")
+    return f"{', '.join(str(path) for path in (out, picture) if path)}: {', '.join(parts)}"
 
 
 def _record(integrator, camera) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def report(
         import scipy  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"this needs {error.name}, which is not installed: pip install 'aniso-pm[report]'"
+            f"this needs {error.name}, which is not installed: pip install jinja2 matplotlib scipy"
         ) from error
     from aniso_pm.report import conclusions, make
     from aniso_pm.report.plan import Plan

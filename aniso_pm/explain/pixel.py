@@ -362,8 +362,8 @@ def _why_nothing(prepared: Prepared, map_, vertices: _Vertices, points) -> str:
         return "path traced alone, this scene needs no photon map (see aniso-pm inspect)"
     if points is None:
         return (
-            "no eye path reads the photon map here: none reaches a receiver "
-            "(see gather_roughness and max_depth)"
+            "no eye path reads the photon map here: all end on emitters, leave the scene, or stay "
+            "on surfaces that do not gather (see gather_roughness and max_depth)"
         )
     return f"no photon was stored, of {map_.emitted:,} light paths: the map gives nothing here"
 

@@ -46,6 +46,18 @@ def conclusions(results: dict[str, Any], scene: dict[str, Any]) -> list[dict[str
     )
 
 
+def too_slow(results: dict[str, Any], scene: dict[str, Any]) -> list[str]:
+    """A sentence for each method of which no budget has a picture of every seed."""
+    shown = {row["method"] for row in results["rows"] if row["scene"] == scene["name"]}
+    failed = {failure["method"] for failure in scene["failures"]}
+    return [
+        f"{method['label']}: no picture within {results['plan']['seconds']:g} s (set-up alone "
+        f"takes {method['setup_seconds']:.2g} s); give a larger --time"
+        for method in scene["methods"]
+        if method["name"] not in shown and method["name"] not in failed
+    ]
+
+
 def as_text(results: dict[str, Any]) -> str:
     """The conclusions of all scenes, one line each, for a terminal."""
     lines = []
@@ -58,6 +70,7 @@ def as_text(results: dict[str, Any]) -> str:
                 f"  {one['label']} / {one['base_label']}, {one['region']} pixels, "
                 f"{one['budget']:g} s: error × {one['value']:.2f}{interval}: {one['verdict']}{note}"
             )
+        lines += [f"  {sentence}" for sentence in too_slow(results, scene)]
         for failure in scene["failures"]:
             seed = "" if failure["seed"] is None else f", seed {failure['seed']}"
             lines.append(f"  {failure['method']}{seed} failed: {failure['reason']}")

@@ -12,7 +12,7 @@ import jinja2
 from aniso_pm import output
 
 from . import metrics, plots, regions
-from .conclusions import conclusions
+from .conclusions import conclusions, too_slow
 from .pictures import HEAT
 
 # What each figure shows, by the first part of its name.
@@ -70,6 +70,7 @@ def write_page(directory: Path, results: dict[str, Any], figures: dict[str, Any]
         results,
         figures=figures,
         conclusions={s["name"]: conclusions(results, s) for s in results["scenes"]},
+        too_slow={s["name"]: too_slow(results, s) for s in results["scenes"]},
         definitions=regions.DEFINITIONS,
         clear=metrics.CLEAR,
         heat=HEAT,

@@ -47,7 +47,8 @@ def figures(results: dict[str, Any], scene: dict[str, Any]) -> dict[str, Figure]
     for size in results["plan"]["sizes"]:
         sweeps = {kernel: of[size] for kernel, of in scene["sweeps"].items() if size in of}
         if sweeps:
-            found[f"bandwidth-{size}"] = _sweeps(sweeps, size)
+            if any(e and e > 0 for sweep in sweeps.values() for _, e in sweep["errors"]):
+                found[f"bandwidth-{size}"] = _sweeps(sweeps, size)
     return found
 
 
@@ -201,6 +202,8 @@ def _budgets(ax, entries) -> None:
 
 def _legend(figure) -> None:
     """Below the axes, where it hides nothing."""
+    if not any(ax.get_legend_handles_labels()[0] for ax in figure.axes):
+        return
     figure.legend(loc="outside lower center", ncols=2, fontsize=7, frameon=False, handlelength=2.6)
 
 

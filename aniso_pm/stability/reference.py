@@ -13,9 +13,7 @@ import numpy as np
 try:
     import mpmath
 except ImportError as error:
-    raise ImportError(
-        "the 50-digit references need mpmath: pip install 'aniso-pm[stability]'"
-    ) from error
+    raise ImportError("the 50-digit references need mpmath: pip install mpmath") from error
 
 # A context of our own: the caller's precision stays what it is.
 mp = mpmath.mp.clone()
