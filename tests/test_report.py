@@ -56,7 +56,7 @@ SCENE = """<scene version="3.0.0">
   </shape>
 </scene>
 """
-QUICK = ("--quick", "--time", "0.4", "--photons", "3000", "--spp", "1")
+QUICK = ("--quick", "--time", "1", "--photons", "3000", "--spp", "1")
 
 
 @pytest.fixture(autouse=True)
