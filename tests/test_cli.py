@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -205,7 +206,8 @@ def test_messages_lose_source_positions_and_line_breaks():
 
 def test_any_integrator_renders_to_exr_and_png(run, scene, tmp_path):
     status, stdout, stderr = run("render", scene(), "-o", "a.exr", "--png", "-D", "spp=9")
-    assert (status, stdout, stderr) == (0, "", "")
+    assert (status, stderr) == (0, "")
+    assert re.fullmatch(r"a\.exr, a\.png: 9 samples a pixel, \d+\.\d s\n", stdout)
     header = OpenEXR.File("a.exr").header()
     assert header["aniso_pm.spp"] == 9 and header["aniso_pm.integrator"] == "PathIntegrator"
     assert header["aniso_pm.versions.mitsuba"] == mi.__version__
