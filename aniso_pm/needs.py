@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import mitsuba as mi
@@ -102,15 +103,19 @@ def read_scene(scene, gather_roughness: float) -> Needs:
 
 def _sharing(scene) -> dict[int, list[str]]:
     """Names of the shapes that share a BSDF, by its address."""
-    found: dict[int, list[str]] = {}
+    found: dict[int, Counter[str]] = {}
     for shape in scene.shapes():
         bsdf = None if shape.class_name() == "Instance" else shape.bsdf()
         if bsdf is not None:
-            found.setdefault(bsdf.ptr, []).append(shape.id() or shape.class_name())
-    for names in found.values():
-        if len(names) > _NAMED:
-            names[_NAMED:] = [f"and {len(names) - _NAMED} more"]
-    return found
+            found.setdefault(bsdf.ptr, Counter())[shape.id() or shape.class_name()] += 1
+    return {address: _listed(names) for address, names in found.items()}
+
+
+def _listed(names: Counter[str]) -> list[str]:
+    """Names, those that occur more than once with their number, and how many are not named."""
+    words = [f"{count} × {name}" if count > 1 else name for name, count in names.items()]
+    rest = len(words) - _NAMED
+    return [*words[:_NAMED], f"and {rest} more"] if rest > 0 else words
 
 
 def _refuse_unlit(needs: Needs, evidence: str):
