@@ -47,8 +47,8 @@ def explain(
     sensor      sensor or its number.
     seed, pass_index  photon map: that of this pass of a rendering with this seed.
     samples     eye paths to trace through random points of the pixel.
-    sample      number of the one that is shown, from 0; default: the one of median contribution
-                among those that follow a lobe, or among all if none does.
+    sample      number of the one that is shown, from 0; default: the one of median throughput
+                among those that follow a lobe and find photons, if there are any.
 
     Raises ValueError for a pixel outside the film, a sample that is not there, and where the
     integrator refuses the scene.
@@ -126,7 +126,9 @@ def explain(
         following=int(follows.sum()),
         pixel_radiance=tuple(map(float, radiance.sum(0) / samples)),
     )
-    chosen = _choose(lanes, follows, radiance.mean(1), sample)
+    # Not by what the kernel finds: another rule is to be seen on the same path.
+    throughput = np.array(points.weight).reshape(-1, size).mean(0)
+    chosen = _choose(lanes, (follows, inside > 0), throughput, sample)
     if chosen is None and sample is not None:
         path = vertices.path(sample, scene, ())
         return replace(found, sentence=f"eye path {sample} reads no photon map", path=path)
@@ -157,16 +159,17 @@ def _check_pixel(pixel, film_):
         )
 
 
-def _choose(lanes, follows, contribution, sample) -> int | None:
+def _choose(lanes, wanted, throughput, sample) -> int | None:
     """Number of the gather point to show."""
     of = np.arange(len(lanes)) if sample is None else np.flatnonzero(lanes == sample)
     if not len(of):
         return None
-    of = of[follows[of]] if follows[of].any() else of
+    for good in wanted:
+        of = of[good[of]] if good[of].any() else of
     if sample is not None:
         return int(of[0])
-    # By number where contributions are equal: the order of the points is that of the threads.
-    order = np.lexsort((lanes[of], contribution[of]))
+    # By number where throughputs are equal: the order of the points is that of the threads.
+    order = np.lexsort((lanes[of], throughput[of]))
     return int(of[order[len(of) // 2]])
 
 
