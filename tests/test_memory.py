@@ -50,7 +50,9 @@ scene = mi.load_dict(rooms.ROOMS[name](size=size))
 plugin = mi.load_dict({"type": "aniso_pm", "initial_radius": 0.01} | parameters)
 before = int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
 plugin.render(scene, spp=spp)
-peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+# Not ru_maxrss: that of a large parent process survives fork and exec.
+status = open("/proc/self/status").read()
+peak = 1024 * int(status.partition("VmHWM:")[2].split()[0])
 print(json.dumps([peak - before, plugin.statistics["memory_estimate"] * 2**30]))
 """
 
