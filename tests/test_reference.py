@@ -156,9 +156,9 @@ def test_limits_of_any_integrator_are_honoured(scene_file):
     assert references.make(world, sensor, spp=4).mean.max() == 0
     for kind in ("path", "prb", "ptracer"):
         integrator = mi.load_dict({"type": kind, "max_depth": 7})
-        assert references._limits(integrator) == {"max_depth": 7, "hide_emitters": False}
+        assert references.path_limits(integrator) == {"max_depth": 7, "hide_emitters": False}
     hidden = mi.load_dict({"type": "path", "hide_emitters": True})
-    assert references._limits(hidden) == {"max_depth": -1, "hide_emitters": True}
+    assert references.path_limits(hidden) == {"max_depth": -1, "hide_emitters": True}
 
 
 def test_integrators_that_start_at_the_lights_agree(scene_file):

@@ -333,14 +333,14 @@ def test_looking_at_pictures_does_not_cost_time(monkeypatch):
     add = runs._Recorder.add
 
     def slow(*arguments):
-        time.sleep(0.05)
+        time.sleep(0.2)
         return add(*arguments)
 
-    swift = runs.run(stage, method, 0.1, 1, [0.2, 0.4])
+    swift = runs.run(stage, method, 0.1, 1, [0.3, 0.6])
     monkeypatch.setattr(runs._Recorder, "add", slow)
-    found = runs.run(stage, method, 0.1, 1, [0.2, 0.4])
-    # A sleep of 50 ms a pass would leave 8 of them.
-    assert found.passes[1] > max(12, 0.4 * swift.passes[1])
+    found = runs.run(stage, method, 0.1, 1, [0.3, 0.6])
+    # A sleep of 200 ms a pass would leave 3 of them.
+    assert found.passes[1] > max(3, 0.3 * swift.passes[1])
     assert sum(found.stages.values()) == pytest.approx(found.seconds[1])
 
 
