@@ -122,7 +122,7 @@ class AnisoPhotonMapper:
        - |float|
        - Error that the sum over a kernel may have, as a share of the flux inside it, between 0 and
          1: small groups of photons inside a kernel count as one. Kernels of thousands of photons
-         gain (five times faster at 9,000 and 0.2), small ones nothing. Receivers that are not
+         gain (twice as fast at 8,000 and 0.2), small ones nothing. Receivers that are not
          Lambertian are summed photon by photon. 0 is the exact sum. (Default: 0)
 
      * - edge_compensation

@@ -16,11 +16,13 @@ import mitsuba as mi
 import numpy as np
 from aniso_pm import index as spatial
 
-from . import grid, walls
+from . import grid, rooms, walls
 from .row import Row
 from .timing import Times, interleaved, run
 
 ASPECTS = {1: 1.0, 16: 0.85, 64: 0.6}
+# Of the sums over nodes.
+TOLERANCE = 0.2
 
 
 def measure(quick: bool) -> Iterator[Row]:
@@ -28,6 +30,7 @@ def measure(quick: bool) -> Iterator[Row]:
     speed: dict[Any, float] = {}
     yield from _even(photons, queries, repetitions, speed)
     yield from _uneven(photons, queries, repetitions, speed)
+    yield _large_kernels(100_000 if quick else 1_000_000, repetitions)
 
 
 def _ours(index, e, visit, total):
@@ -151,6 +154,34 @@ def _uneven(photons, queries, repetitions, speed) -> Iterator[Row]:
         None,
         f"cells as large as the largest kernel, {few} queries: "
         f"{_said('grid', few / rival.best, rival)}",
+    )
+
+
+def _large_kernels(photons: int, repetitions: int) -> Row:
+    """Sums over nodes against sums over photons, in a picture with thousands of them a kernel."""
+    scene = mi.load_dict(rooms.glass_and_metal(48))
+    common = {"type": "aniso_pm", "photon_count": photons, "initial_radius": 0.07}
+    integrators = {
+        tolerance: mi.load_dict(common | {"gather_tolerance": tolerance})
+        for tolerance in (0.0, TOLERANCE)
+    }
+
+    def gather(integrator) -> float:
+        integrator.render(scene, spp=4)
+        return integrator.statistics["seconds"]["gather"]
+
+    tasks = {tolerance: partial(gather, plugin) for tolerance, plugin in integrators.items()}
+    times = interleaved(tasks, repetitions)
+    exact, taken = (np.array(i.render(scene, spp=4)).mean() for i in integrators.values())
+    counts = integrators[0.0].statistics
+    return Row(
+        f"gather: gather_tolerance={TOLERANCE:g} against the exact sum",
+        times[0.0].best / times[TOLERANCE].best,
+        "×",
+        None,
+        f"{counts['photons_gathered'] / counts['gather_points']:,.0f} photons a kernel, stage "
+        f"gather of a picture, best of {repetitions}: exact {times[0.0]}, with sums {times[TOLERANCE]}; "
+        f"mean of the picture {taken / exact - 1:+.1e}",
     )
 
 

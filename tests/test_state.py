@@ -1,0 +1,259 @@
+"""States on disk: resumed, merged, refused by name where they belong to something else."""
+
+import json
+from pathlib import Path
+
+import aniso_pm  # noqa: F401
+import mitsuba as mi
+import numpy as np
+import pytest
+from aniso_pm.state import Checkpoint, State, StateError, describe, merge
+from passes import close, integrator, load, render
+from rooms import room, room_with_plate
+
+
+@pytest.fixture(autouse=True)
+def _variant(variant_llvm_rgb):
+    pass
+
+
+@pytest.fixture
+def states(tmp_path):
+    """Files with passes 0-1 and 2-3, and the picture of all four."""
+    scene = load()
+    paths = [tmp_path / "a.state", tmp_path / "b.state"]
+    for path, first in zip(paths, (0, 2), strict=True):
+        render(scene, integrator(passes=2), 4, 1, first, Checkpoint(path))
+    return paths, scene, render(scene, integrator(passes=4), 8)
+
+
+def test_states_merge_into_the_picture_of_all_passes(states):
+    paths, scene, whole = states
+    for order in (paths, paths[::-1]):
+        total = merge({path.name: State.load(path) for path in order})
+        assert total.passes == [[0, 4]] and total.statistics["spp"] == 8
+        assert total.statistics["photons_emitted"] == 4 * 3000
+        close(total.arrays["first"][..., :-1] / total.arrays["first"][..., -1:], whole)
+    plugin = integrator(passes=4)
+    render(scene, plugin, 8)
+    np.testing.assert_allclose(total.variance(), plugin.variance, rtol=0.02, atol=1e-7)
+
+
+def test_resuming_renders_the_missing_passes_only(states):
+    paths, scene, whole = states
+    plugin = integrator(passes=4)
+    seen = []
+    plugin.callback = lambda i, image, statistics: seen.append(i)
+    image = render(scene, plugin, 8, checkpoint=Checkpoint(paths[1], resume=True))
+    assert seen == [0, 1]
+    close(image, whole)
+    assert plugin.statistics["passes"] == 4 and plugin.statistics["spp"] == 8
+    seen.clear()
+    close(render(scene, plugin, 8, checkpoint=Checkpoint(paths[1], resume=True)), whole)
+    assert seen == []
+
+
+def test_resuming_keeps_the_bandwidth_that_the_pilot_chose(tmp_path):
+    path = tmp_path / "a.state"
+    scene = load()
+    render(scene, integrator(passes=2, initial_radius=0.0), 4, checkpoint=Checkpoint(path))
+    state = State.load(path)
+    chosen = state.identity["initial radius"]
+    state.identity["initial radius"] = 0.5 * chosen
+    state.save(path)
+    plugin = integrator(passes=3, initial_radius=0.0)
+    render(scene, plugin, 6, checkpoint=Checkpoint(path, resume=True))
+    assert plugin.statistics["initial_radius"] == 0.5 * chosen
+
+
+def test_resuming_a_time_budget_counts_what_was_spent(tmp_path):
+    path = tmp_path / "a.state"
+    scene = load()
+    render(scene, integrator(passes=2), 4, checkpoint=Checkpoint(path))
+    state = State.load(path)
+    state.seconds = 100.0
+    state.save(path)
+    plugin = integrator(time=50.0)
+    render(scene, plugin, 2, checkpoint=Checkpoint(path, resume=True))
+    assert plugin.statistics["passes"] == 2
+
+
+@pytest.mark.parametrize(
+    "change, named",
+    [
+        ({"rule": "taylor"}, 'parameter "rule" was lobe, is taylor'),
+        ({"photon_count": 3001}, "photon count was 3000, is 3001"),
+        ({"initial_radius": 0.2}, "initial radius was 0.15, is 0.2"),
+        ({"hide_emitters": True}, 'parameter "hide_emitters" was False, is True'),
+    ],
+)
+def test_other_parameters_are_refused_by_name(states, change, named):
+    paths, scene, _ = states
+    with pytest.raises(StateError, match=named):
+        render(scene, integrator(passes=4, **change), 8, checkpoint=Checkpoint(paths[0], 30, True))
+
+
+@pytest.mark.parametrize(
+    "options, named",
+    [
+        ({"seed": 2}, "seed was 1, is 2"),
+        ({"spp": 12}, "samples per pass was 2, is 3"),
+        ({"first_pass": 1}, "holds passes 0-1, but passes 1-4 are asked for"),
+    ],
+)
+def test_other_passes_are_refused_by_name(states, options, named):
+    paths, scene, _ = states
+    options = {"spp": 8, "seed": 1, "first_pass": 0} | options
+    with pytest.raises(StateError, match=named):
+        render(scene, integrator(passes=4), checkpoint=Checkpoint(paths[0], 30, True), **options)
+
+
+def _brighter(definition):
+    definition["light"]["emitter"]["radiance"]["value"] = [8, 7.5, 7.1]
+
+
+def _moved(definition):
+    T = mi.ScalarTransform4f
+    definition["floor"]["to_world"] = T().translate([0, 1e-4, 0]) @ definition["floor"]["to_world"]
+
+
+def _other_distribution(definition):
+    definition["plate"]["bsdf"]["bsdf"]["distribution"] = "ggx"
+
+
+def _without(definition):
+    del definition["left"]
+
+
+def _turned(definition):
+    definition["sensor"]["fov"] = 75.01
+
+
+def _cropped(definition):
+    definition["sensor"]["film"] |= {"width": 9}
+
+
+@pytest.mark.parametrize(
+    "change, named",
+    [
+        (_brighter, "scene, light has changed"),
+        (_moved, "scene, floor has changed"),
+        (_other_distribution, "scene, plate has changed"),
+        (_without, "scene, left is only in the other one"),
+        (_turned, "camera has changed"),
+        (_cropped, "film size was 8x8, is 9x8"),
+    ],
+)
+def test_another_scene_is_refused_by_what_changed(states, change, named):
+    paths, _, _ = states
+    definition = room_with_plate(8)
+    change(definition)
+    scene = mi.load_dict(definition, optimize=False)
+    with pytest.raises(StateError, match=named):
+        render(scene, integrator(passes=4), 8, checkpoint=Checkpoint(paths[0], 30, True))
+
+
+def test_the_same_scene_is_recognised_whatever_the_order_of_its_objects(states):
+    """Meshes are merged in the order of their addresses, and computed normals are sums in the
+    order of threads: neither is a different scene."""
+    from aniso_pm.digest import scene_entries
+
+    definition = room_with_plate(8)
+    backwards = dict(reversed(definition.items()))
+    first, second = (mi.load_dict(d, optimize=False) for d in (definition, backwards))
+    assert scene_entries(first) == scene_entries(second)
+    assert len(scene_entries(first)) == 8
+
+
+def test_a_texture_is_part_of_the_scene(tmp_path):
+    from aniso_pm.digest import scene_entries
+
+    def entries(value):
+        data = mi.TensorXf(np.full((4, 4, 3), value, dtype=np.float32))
+        texture = {"type": "bitmap", "data": data, "raw": True}
+        bsdf = {"type": "diffuse", "reflectance": texture}
+        return scene_entries(mi.load_dict({"type": "scene", "a": {"type": "sphere", "bsdf": bsdf}}))
+
+    assert entries(0.5) == entries(0.5) != entries(0.50001)
+
+
+def test_overlapping_and_foreign_states_do_not_merge(states):
+    paths, scene, _ = states
+    a, b = (State.load(path) for path in paths)
+    with pytest.raises(StateError, match="c: pass 0 is already"):
+        merge({"a": a, "b": b, "c": a})
+    other = State.load(paths[1])
+    other.identity["seed"] = 9
+    with pytest.raises(StateError, match="b and a.*seed was 9, is 1"):
+        merge({"a": a, "b": other})
+    assert describe([[0, 8], [16, 17]]) == "0-7, 16"
+
+
+def test_damaged_states_are_never_read_as_data(states):
+    """Truncated anywhere, any bit flipped (but for bits that zip does not use), or not a state."""
+    path = states[0][0]
+    data = path.read_bytes()
+    whole = State.load(path)
+    rng = np.random.default_rng(0)
+    for length in [0, 1, 100, len(data) - 1, *rng.integers(0, len(data), 40)]:
+        path.write_bytes(data[:length])
+        with pytest.raises(StateError, match="delete it to start afresh"):
+            State.load(path)
+    refused = 0
+    for position in rng.integers(0, len(data), 200):
+        flipped = bytearray(data)
+        flipped[position] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        try:
+            state = State.load(path)
+        except StateError:
+            refused += 1
+            continue
+        # Time stamps and attributes of the archive: what is read is what was written.
+        assert state.identity == whole.identity and state.passes == whole.passes
+        assert all((state.arrays[k] == whole.arrays[k]).all() for k in whole.arrays)
+    assert refused > 150
+
+
+def test_a_consistent_archive_with_a_changed_value_is_refused(states):
+    path = states[0][0]
+    with np.load(path) as archive:
+        content = dict(archive)
+    content["first"][0, 0, 0] += 1
+    with open(path, "wb") as file:
+        np.savez(file, **content)
+    with pytest.raises(StateError, match="checksum"):
+        State.load(path)
+    content["header"] = np.array(json.dumps(json.loads(str(content["header"])) | {"version": 99}))
+    with open(path, "wb") as file:
+        np.savez(file, **content)
+    with pytest.raises(StateError, match="format 99"):
+        State.load(path)
+
+
+def test_state_and_picture_are_saved_on_the_way(tmp_path):
+    path = tmp_path / "a.state"
+    written = []
+    plugin = integrator(passes=5)
+    hook = lambda: written.append(State.load(path).passes)  # noqa: E731
+    render(load(), plugin, 5, checkpoint=Checkpoint(path, 0.0, on_write=hook))
+    # Saving may take no more than a twentieth of the time: not necessarily after every pass.
+    assert written and written[0][0][0] == 0
+    assert State.load(path).passes == [[0, 5]]
+    assert [p.name for p in Path(tmp_path).iterdir()] == ["a.state"]
+
+
+def test_checkpoints_of_films_with_alpha_crop_and_other_colours(tmp_path):
+    definition = room(size=8)
+    definition["sensor"]["film"] |= {"pixel_format": "luminance_alpha", "crop_width": 5}
+    scene = mi.load_dict(definition, optimize=False)
+    path = tmp_path / "a.state"
+    image = render(scene, integrator(passes=2), 4, checkpoint=Checkpoint(path))
+    state = State.load(path)
+    from aniso_pm import film as films
+
+    film = films.from_description(state.film)
+    films.show_array(film, state.arrays["first"])
+    assert image.shape == (8, 5, 2)
+    close(np.array(film.develop()), image)
+    assert state.variance().shape == (8, 5, 4)
