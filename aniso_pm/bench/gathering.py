@@ -180,7 +180,8 @@ def _large_kernels(photons: int, repetitions: int) -> Row:
         "×",
         None,
         f"{counts['photons_gathered'] / counts['gather_points']:,.0f} photons a kernel, stage "
-        f"gather of a picture, best of {repetitions}: exact {times[0.0]}, with sums {times[TOLERANCE]}; "
+        f"gather of a picture, best of {repetitions}: exact {times[0.0]}, with sums "
+        f"{times[TOLERANCE]}; "
         f"mean of the picture {taken / exact - 1:+.1e}",
     )
 
