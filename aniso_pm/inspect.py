@@ -89,6 +89,7 @@ def examine(scene: Prepared) -> list[Finding]:
             "light paths are shared by power" if len(emitters) > 1 else "nothing to choose",
             emitters or ["the scene has no emitters"],
         ),
+        _environment(scene),
         Finding(
             "path length of photons",
             scene.gather_depth > 0,
@@ -118,6 +119,21 @@ def examine(scene: Prepared) -> list[Finding]:
             [spectrum],
         ),
     ]
+
+
+def _environment(scene: Prepared) -> Finding:
+    """What surrounds the scene, and what its emitter's own rays would have done."""
+    found = scene.emission.environment if scene.emission is not None else None
+    if found is None:
+        return Finding("light from all around", False, "nothing surrounds the scene", [])
+    brightness = found.own_brightness()
+    wrong = f"would be {brightness:.2f} times as bright" if abs(brightness - 1) > 0.05 else "agrees"
+    return Finding(
+        "light from all around",
+        scene.needs_map,
+        "light paths take directions from emitter sampling and start on discs across them",
+        [emitter_name(found.emitter), f"its own sample_ray, which is not used, {wrong}"],
+    )
 
 
 def kernels(scene: Prepared) -> Finding:

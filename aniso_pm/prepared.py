@@ -286,12 +286,12 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
             f'aniso_pm: variant "{mi.variant()}" is not supported (photons carry no '
             "polarisation); choose llvm_ad_rgb or another unpolarized variant"
         )
+    _repair_bounds(scene)  # before light from outside is aimed at them
     try:
         needs = read_scene(scene, settings.gather_roughness)
         source = emission.prepare(scene) if scene.emitters() else None
     except ValueError as error:
         raise Unsupported(str(error)) from None
-    _repair_bounds(scene)
     prepared = Prepared(scene, needs, settings, hide_emitters, source)
     radius, extent = settings.initial_radius, prepared.extent
     if radius and scene.shapes() and not 1e-7 * extent <= radius <= 10 * extent:
