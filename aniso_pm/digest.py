@@ -42,13 +42,18 @@ def scene_entries(scene) -> dict[str, str]:
     return {name: "#" + "".join(sorted(hashes)) for name, hashes in found.items()}
 
 
-def camera_entries(sensor) -> dict[str, Any]:
-    """Camera, film and sampler, without the number of samples."""
+# What is left of its description, as a camera prints it.
+_DEFAULT_SAMPLER = "IndependentSampler[\n    base_seed = 0\n    \n    \n    \n  ]"
+
+
+def camera_entries(sensor, with_sampler: bool = True) -> dict[str, Any]:
+    """Camera, film and, if it matters, sampler, without the number of samples. Without it the
+    camera counts as one with Mitsuba's default sampler."""
     film = sensor.film()
     return {
         "film size": "x".join(str(n) for n in film.size()),
         "film": "#" + _digest(str(film)),
-        "camera": "#" + _hash(sensor),
+        "camera": "#" + _hash(sensor, with_sampler),
     }
 
 
@@ -94,8 +99,10 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
     return result
 
 
-def _hash(thing) -> str:
+def _hash(thing, with_sampler: bool = True) -> str:
     text = re.sub(r"(sample_count|samples_per_wavefront|wavefront_size) = \d+", "", str(thing))
+    if not with_sampler:
+        text = re.sub(r"sampler = \w+ ?\[[^]]*\]", f"sampler = {_DEFAULT_SAMPLER}", text)
     pieces: list[str | bytes] = [text]
     parameters = mi.traverse(thing)
     for index, key in enumerate(parameters.keys()):

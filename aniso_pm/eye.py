@@ -28,6 +28,42 @@ from .rays import largest_coordinate, spawn_ray
 from .receivers import gathered_part, read_receiver
 
 
+@dataclass
+class Thinning:
+    """Which eye paths read the photon map: a share of them, with the weight 1/share.
+
+    Samples of a pixel read much the same photons. Sample k of a pixel gathers where
+    frac(k φ + ξ) < share, φ the golden ratio and ξ random for the pixel: each sample with the same
+    chance, so that the mean is right, and of any number of consecutive samples that share within
+    one or two, however they are spread over wavefronts and passes.
+
+    share         of the paths, above 0 and at most 1.
+    seed          of the choice.
+    first_pixel   pixel of the first lane, first_sample its number among the pixel's samples.
+    samples       consecutive lanes of a pixel.
+    """
+
+    share: Any
+    seed: Any
+    first_pixel: Any
+    first_sample: Any
+    samples: Any
+
+    @staticmethod
+    def of(share: float, seed: int, first_pixel: int, first_sample: int, samples: int) -> Thinning:
+        """For one wavefront."""
+        numbers = (seed, first_pixel, first_sample, samples)
+        return Thinning(dr.opaque(mi.Float, share), *(dr.opaque(mi.UInt32, n) for n in numbers))
+
+    def chosen(self, lane):
+        """Does the path gather?"""
+        pixel = lane // self.samples
+        sample = self.first_sample + lane - pixel * self.samples
+        start, _ = mi.sample_tea_32(pixel + self.first_pixel, self.seed)
+        u = mi.Float((sample * 0x9E3779B9 + start) >> 8) * 2.0**-24
+        return u < self.share
+
+
 @dataclass  # not frozen: Dr.Jit writes back whatever a loop mentions
 class WalkOptions:
     """Decisions for one scene; what is off is not traced.
@@ -43,6 +79,8 @@ class WalkOptions:
     deep           the scene has surfaces to walk on (``needs.chains``).
     general        the scene has receivers that are not Lambertian (``needs.general``).
     roughness      smallest alpha that is gathered on.
+    measure        keep the length of the path at gather points.
+    thinning       which paths leave gather points; None: all do.
     """
 
     use: str
@@ -55,6 +93,8 @@ class WalkOptions:
     deep: bool
     general: bool
     roughness: float
+    measure: bool = False
+    thinning: Thinning | None = None
 
 
 @dataclass
@@ -69,6 +109,7 @@ class GatherPoints:
     origin, d  ray that found p, or None where all receivers are Lambertian.
     lambertian is the receiver Lambertian? None where all are.
     caustic    only caustic photons are to be read; None where all points agree.
+    distance   length of the path from the camera, world units; None where nobody asks.
     """
 
     lane: Any
@@ -81,6 +122,7 @@ class GatherPoints:
     d: Any
     lambertian: Any
     caustic: Any
+    distance: Any = None
 
 
 def map_tree(function, *trees: Any) -> Any:
@@ -162,7 +204,7 @@ def _first_lobe(o: WalkOptions) -> LobeOnPath | None:
     return no_lobe() if o.follow_lobes else None
 
 
-def _point(o: WalkOptions, lane, si, ray, weight, depth, path, lambertian, scattered):
+def _point(o: WalkOptions, lane, si, ray, weight, depth, path, lambertian, scattered, distance):
     """A gather point with the fields that the scene needs."""
     return GatherPoints(
         lane=lane,
@@ -175,13 +217,15 @@ def _point(o: WalkOptions, lane, si, ray, weight, depth, path, lambertian, scatt
         d=ray.d if o.general else None,
         lambertian=lambertian if o.general else None,
         caustic=~scattered if o.use == "final_gather" else None,
+        distance=distance if o.measure else None,
     )
 
 
 def _blank(o: WalkOptions) -> GatherPoints:
     si, ray = dr.zeros(mi.SurfaceInteraction3f), dr.zeros(mi.Ray3f)
     no = mi.Bool(False)
-    return _point(o, mi.UInt32(0), si, ray, mi.Spectrum(0), mi.UInt32(0), _first_lobe(o), no, no)
+    zero = mi.UInt32(0)
+    return _point(o, zero, si, ray, mi.Spectrum(0), zero, _first_lobe(o), no, no, mi.Float(0))
 
 
 @dr.syntax
@@ -205,6 +249,10 @@ def _walk(scene, sampler, ray, options, push, see):
     pdf_prev = mi.Float(1)  # Density of the last BSDF sample
     delta_prev = mi.Bool(True)  # Was it a delta distribution (or the camera)?
     path = _first_lobe(o)
+    distance = mi.Float(0)  # Length of the path
+    chosen, worth = mi.Bool(True), mi.Float(1)  # Does the path gather, and for how many others?
+    if dr.hint(o.thinning is not None, mode="scalar"):
+        chosen, worth = o.thinning.chosen(lane), dr.rcp(o.thinning.share)
 
     while dr.hint(active, label="eye paths"):
         # --- Find the next vertex ---
@@ -247,8 +295,12 @@ def _walk(scene, sampler, ray, options, push, see):
         L[here & ~finite] = dr.nan  # counted and dropped later
         if dr.hint(o.follow_lobes, mode="scalar"):
             path.distance += dr.select(active, si.t, 0)
+        if dr.hint(o.measure, mode="scalar"):
+            distance += dr.select(active, si.t, 0)
         if dr.hint(o.gathers, mode="scalar"):
-            point = _point(o, lane, si, ray, weight, depth, path, lambertian, scattered)
+            here &= chosen
+            weight *= worth
+            point = _point(o, lane, si, ray, weight, depth, path, lambertian, scattered, distance)
             push(point, here & finite)
 
         # --- Sample the BSDF ---

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import density
+from .film import rays_through, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 
 # Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
@@ -23,6 +24,9 @@ PHOTONS_PER_KERNEL = 60
 FEWEST, MOST = 10_000, 5_000_000
 # Light paths and eye paths of the pilot, and photons that a disc must hold to be measured.
 _PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
+# Smallest share of eye paths that gather, smallest number of them in a pixel and pass, and the work
+# of an eye path and the photons of a pass without gathering.
+_LEAST_SHARE, _GATHERS_PER_PIXEL, _REST = 1 / 8, 2, 1.5
 # Range of radii as shares of the scene's extent: 1e-5 · √2^27 = 0.1.
 _SMALLEST, LARGEST, _STEPS = 1e-5, 0.1, 27
 
@@ -48,6 +52,55 @@ def settle(scene: Prepared, sensor, seed: int, samples: int, count=None, radius=
         count = count or automatic_photon_count(scene, rays, seed, samples)
         radius = radius or automatic_radius(scene.with_(photon_count=count), rays, seed)
     return count, radius
+
+
+def share_of_gathers(scene: Prepared, sensor, radius: float, seed: int, samples: int) -> float:
+    """Share of the eye paths that gather (see ``eye.Thinning``), from pairs of eye paths in pixels.
+
+    With the variance V_g of what is gathered and V_r of all the rest within a pixel, and the work
+    C_g of a gather and C_r of everything else for an eye path, variance times work,
+    (V_r + V_g/q)(C_r + q C_g), is smallest at q² = V_g C_r / (V_r C_g). Work is counted.
+
+    samples: eye samples of a pixel in a pass, of which four at least shall gather.
+    """
+    least = max(_LEAST_SHARE, min(1.0, _GATHERS_PER_PIXEL / samples))
+    if least == 1:
+        return 1.0
+    colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
+    pilot = scene.with_(photon_count=_PATHS)
+    map_ = pilot.photon_map(stream_seed(seed, PILOT), 0, wavelengths=colours)
+    if map_.stored == 0:
+        return 1.0
+    # A pilot's photons are too few for the bandwidth of the pass.
+    wider = math.sqrt(max(1.0, scene.settings.photon_count / map_.emitted))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(stream_seed(seed, PILOT, 3), _RAYS)
+    size = sensor.film().crop_size()
+    corner = mi.Point2f(mi.ScalarPoint2f(sensor.film().crop_offset()))
+    lane = dr.arange(mi.UInt32, _RAYS // 2)
+    a, b = mi.sample_tea_32(lane, stream_seed(seed, PILOT, 4))
+    pixel = mi.Point2f(a % size[0], b % size[1])
+    pixel = dr.gather(mi.Point2f, pixel, dr.arange(mi.UInt32, _RAYS) // 2)
+    ray, _ = rays_through(sensor, sampler, corner + pixel + sampler.next_2d(), 0.5)
+    L, _, points = scene.trace(sampler, ray)
+    if points is None:
+        return 1.0
+    light = dr.zeros(mi.Float, _RAYS)
+    photons = 0.0
+    r = dr.opaque(mi.Float, wider * radius)
+    for found in scene.gather(map_, r, seed, points, colours):
+        dr.scatter_add(light, dr.mean(found.radiance), found.lane)
+        photons += float(dr.sum(mi.Float(found.photons))[0])
+    gathered = np.nan_to_num(light.numpy()).reshape(-1, 2)
+    rest = np.nan_to_num(dr.mean(L).numpy() + np.zeros(_RAYS)).reshape(-1, 2)
+    level = (gathered + rest).mean(1)
+    weight = 1 / (level**2 + (0.1 * np.quantile(level, 0.5)) ** 2 + 1e-30)
+    within = lambda v: float(np.mean(weight * (v[:, 0] - v[:, 1]) ** 2))  # noqa: E731
+    V_g, V_r = within(gathered), within(rest)
+    C_g = dr.width(points.lane) / _RAYS * (0.8 + photons / dr.width(points.lane) / 40)
+    share = math.sqrt(V_g * _REST / (V_r * C_g)) if V_r > 0 else 1.0
+    # In steps, so that machines whose arithmetic differs in the last digits agree.
+    return min(16, math.ceil(16 * max(least, share))) / 16
 
 
 def _weighted_median(radii) -> float:

@@ -12,11 +12,12 @@ import drjit as dr
 import mitsuba as mi
 
 from . import density, emission, eye, photons, summed
+from .footprint import Footprint
 from .needs import Needs, read_scene
 from .settings import Settings
 
 # Independent streams of random numbers.
-EYE, PROBE, PHOTONS, PILOT, COLOUR = range(5)
+EYE, PROBE, PHOTONS, PILOT, COLOUR, THINNING = range(6)
 
 
 class Unsupported(ValueError):
@@ -56,6 +57,7 @@ class Prepared:
     emission: emission.Emission | None
     launch: Launch = Launch()
     light_wavefront: int | None = None  # light paths at once; None: photons.WAVEFRONT
+    footprint: Footprint | None = None  # of pixels; None: one bandwidth for all of a pass
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -190,9 +192,9 @@ class Prepared:
             lap("index")
         return map_
 
-    def trace(self, sampler, ray, expected: int = 0, see=None):
+    def trace(self, sampler, ray, expected: int = 0, see=None, thinning=None):
         """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``, and
-        ``eye.eye_paths`` for ``see``."""
+        ``eye.eye_paths`` for ``see``, ``eye.Thinning``."""
         s = self.settings
         options = eye.WalkOptions(
             self.use,
@@ -205,6 +207,8 @@ class Prepared:
             self.deep,
             bool(self.needs.general),
             s.gather_roughness,
+            self.footprint is not None and self.needs_map,
+            thinning,
         )
         launch = partial(self.launch.eye, see=see) if see else self.launch.eye
         return eye.trace(self.scene, sampler, ray, options, expected, launch)
@@ -232,7 +236,14 @@ class Prepared:
                 parts.append(self._gather(map_, radius, seed, some, surface))
         return parts
 
+    def bandwidth(self, points: eye.GatherPoints, radius):
+        """Of each gather point, world units. radius: of the pass."""
+        if self.footprint is None:
+            return radius
+        return radius * self.footprint.share(points.distance)
+
     def _gather(self, map_, radius, seed, points, surface) -> density.Gathered:
+        radius = self.bandwidth(points, radius)
         kernel, follows, degenerate = density.kernels(points, radius, self.kernel_options)
         L, count = density.estimate(
             map_,
@@ -257,7 +268,15 @@ class Prepared:
         return found
 
     def radiance(
-        self, sampler, ray, map_, radius, seed: int, expected: int = 0, lap=lambda stage: None
+        self,
+        sampler,
+        ray,
+        map_,
+        radius,
+        seed: int,
+        expected: int = 0,
+        lap=lambda stage: None,
+        thinning: eye.Thinning | None = None,
     ) -> Radiance:
         """Radiance along camera rays: their own share and the map's.
 
@@ -265,8 +284,9 @@ class Prepared:
         seed      of the random numbers that density estimation takes.
         expected  gather points to make room for.
         lap       called with the name of each stage that ends.
+        thinning  which eye paths gather; None: all.
         """
-        L, valid, points = self.trace(sampler, ray, expected)
+        L, valid, points = self.trace(sampler, ray, expected, thinning=thinning)
         lap("eye")
         gathered = []
         if points is not None and map_.stored:

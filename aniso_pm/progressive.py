@@ -18,13 +18,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import advice, digest, memory, state
+from . import advice, digest, footprint, memory, state
 from . import film as films
 from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .clock import Clock
 from .errors import is_interrupt
-from .pilot import photons_per_path, settle
-from .prepared import EYE, PROBE, Prepared, stream_seed
+from .eye import Thinning
+from .pilot import photons_per_path, settle, share_of_gathers
+from .prepared import EYE, PROBE, THINNING, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
 from .stopping import Stopping
 
@@ -158,6 +159,12 @@ class _Run:
         self.scene = self.scene.with_(photon_count=count)
         self.plan = memory.plan(self.scene, *self._job())
         self.scene = replace(self.scene, light_wavefront=self.plan.light_paths)
+        if not settings.initial_radius:
+            pixel = footprint.of(self.sensor, self.radius0)
+            self.scene = replace(self.scene, footprint=pixel)
+        self.share = known.get("share of gathers") or share_of_gathers(
+            self.scene, self.sensor, self.radius0, self.seed, self.shares.each
+        )
         self.clock.lap("pilot")
         # The response curves of a specfilm do not survive a replay of the scene that they are in.
         special = mi.has_flag(self.film.flags(), mi.FilmFlags.Special)
@@ -169,10 +176,12 @@ class _Run:
             self.identity |= {
                 "initial radius": self.radius0,
                 "photon count": count,
+                "share of gathers": self.share,
             }
         self.statistics |= {
             "initial_radius": self.radius0,
             "radius_automatic": settings.initial_radius == 0,
+            "share_of_gathers": self.share,
             "photon_count": count,
             "photon_count_automatic": settings.photon_count == 0,
             "map": self.scene.use if self.scene.needs_map else "none",
@@ -307,17 +316,22 @@ class _Run:
             at_once = min(pixels, self.plan.eye_samples)
         # An array, not a number: as a literal it would make every pass compile kernels of its own.
         radius = dr.opaque(mi.Float, self.radius)
+        scene = replace(scene, footprint=footprint.in_pass(scene.footprint, index))
         image = None
         taken = wavefront = 0
         while taken < spp:
             for first in range(0, pixels, at_once):
                 some = min(at_once, pixels - first)
-                sampler = sensor.sampler().clone()
-                sampler.set_sample_count(min(per_wavefront, spp - taken))
-                count = sampler.sample_count()  # samplers may round it up
-                sampler.set_samples_per_wavefront(count)
-                seed = mi.sample_tea_32(stream_seed(self.seed, EYE, index), wavefront)[0]
-                sampler.seed(seed, some * count)
+                count = min(per_wavefront, spp - taken)
+                sampler = mi.load_dict({"type": "owen_sobol", "sample_count": count})
+                sampler.first_pixel = first
+                sampler.first_sample = self.shares.before(index) + taken
+                sampler.seed(stream_seed(self.seed, EYE), some * count)
+                thinning = None
+                if self.share < 1:
+                    random = stream_seed(self.seed, THINNING)
+                    begin = sampler.first_sample
+                    thinning = Thinning.of(self.share, random, first, begin, count)
 
                 # --- Eye paths and density estimation ---
                 ray, ray_weight, position = films.sample_rays(
@@ -326,7 +340,9 @@ class _Run:
                 dr.eval(ray, ray_weight, position)
                 seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
                 room = self.points.room
-                seen = scene.radiance(sampler, ray, map_, radius, seed, room, self.clock.lap)
+                seen = scene.radiance(
+                    sampler, ray, map_, radius, seed, room, self.clock.lap, thinning
+                )
                 self._count(seen.gathered, counts)
 
                 # --- Into the image ---

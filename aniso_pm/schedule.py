@@ -32,6 +32,11 @@ class Shares:
     def __call__(self, index: int) -> int:
         return self.each + (index in self.one_more)
 
+    def before(self, index: int) -> int:
+        """Samples per pixel of all passes from number 0 to that before ``index``."""
+        more = min(max(index - self.one_more.start, 0), len(self.one_more))
+        return index * self.each + more
+
 
 def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Shares:
     """How the passes share ``spp`` samples per pixel.

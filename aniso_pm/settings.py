@@ -22,7 +22,7 @@ class Settings:
     epsilon: float = 0.02
     guard: bool = True
     max_aspect: float = 32.0
-    map: str = "global"
+    map: str = "auto"
     final_gather: bool = False
     gather_roughness: float = 0.2
     photon_count: int = 250_000
@@ -56,7 +56,7 @@ class Settings:
         self._between("epsilon", 1e-8, 10)
         self._between("max_aspect", 1, 1e4)
         self._one_of("map", "global", "caustic", "auto")
-        if self.final_gather and self.map != "global":
+        if self.final_gather and self.map == "caustic":
             raise ValueError(
                 f'aniso_pm: parameter "final_gather" needs the global map, but "map" is '
                 f'"{self.map}"; remove one of them'

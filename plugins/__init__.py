@@ -25,12 +25,15 @@ def _on_variant(old: str | None, new: str) -> None:
     if new.startswith("scalar_"):
         mi.register_integrator("aniso_pm", _refuse_scalar)
         mi.register_bsdf("asgconductor", _refuse_scalar)
+        mi.register_sampler("owen_sobol", _refuse_scalar)
         return
     from .asgconductor import ASGConductor
     from .integrator import AnisoPhotonMapper
+    from .sampler import OwenSobol
 
     mi.register_integrator("aniso_pm", _bind(AnisoPhotonMapper, mi.SamplingIntegrator))
     mi.register_bsdf("asgconductor", _bind(ASGConductor, mi.BSDF))
+    mi.register_sampler("owen_sobol", _bind(OwenSobol, mi.Sampler))
 
 
 def _bind(template: type, base: type) -> type:
@@ -42,6 +45,6 @@ def _bind(template: type, base: type) -> type:
 
 def _refuse_scalar(props):
     raise RuntimeError(
-        f'{props.plugin_name()}: the variant "{mi.variant()}" has no Dr.Jit arrays to trace '
-        'photons with; choose a vectorised one: mi.set_variant("llvm_ad_rgb"), or -m llvm_ad_rgb'
+        f'{props.plugin_name()}: the variant "{mi.variant()}" has no Dr.Jit arrays to '
+        'work with; choose a vectorised one: mi.set_variant("llvm_ad_rgb"), or -m llvm_ad_rgb'
     )

@@ -66,7 +66,7 @@ class AnisoPhotonMapper:
          ``auto``: ``global`` if the scene has surfaces that light is traced over (glass, mirrors,
          smooth or coated metal) or lights that only photons find; else no map and no photons, as
          ``caustic`` does there. ``statistics["map"]`` tells which it was, or "none".
-         (Default: ``global``)
+         (Default: ``auto``)
 
      * - final_gather
        - |bool|
@@ -110,8 +110,10 @@ class AnisoPhotonMapper:
        - |float|
        - Kernel radius r of the first pass in world units: weight exp(-a²-b²) with half axes of
          :math:`|s \times t| = r^2`, cut at :math:`a^2+b^2=4`. 0 chooses the radius at which a
-         kernel holds 60 photons, in the median over the light that the camera sees; the choice is
-         in ``statistics["initial_radius"]``. (Default: 0)
+         kernel holds 60 photons, in the median over the light that the camera sees
+         (``statistics["initial_radius"]``); later passes make do with fewer: 1.75 times the
+         width of a pixel where the kernel is, between that radius and 1/(i+1) of it, or a fifth.
+         (Default: 0)
 
      * - alpha
        - |float|
@@ -159,7 +161,13 @@ class AnisoPhotonMapper:
 
     After ``render()`` the attribute ``statistics`` holds counts and timings. After two passes or
     more ``variance`` holds the variance of the picture (NumPy array, height × width × channels),
-    estimated from the spread of the passes; its root is the standard error.
+    estimated from the spread of the passes; its root is the standard error. Passes share one
+    stratified sequence, so that their mean is better than their spread says: an upper estimate.
+
+    Eye paths take their random numbers from an ``owen_sobol`` sequence that goes on from pass to
+    pass, whatever the sampler of the scene, which says only how many samples there are. Some of the
+    eye paths of a pixel read the photon map for all of them, as many as a pilot finds worth their
+    time (``statistics["share_of_gathers"]``).
 
     Before ``render()`` these attributes may be set: ``progress``, a function (done, total, text)
     that is called after each wavefront (see ``aniso_pm.progress.bar``); ``callback``, a function

@@ -20,7 +20,11 @@ from rooms import room, wall
 
 REFERENCE = Path(__file__).with_name("matrix.json")
 TILES = str(REFERENCE.parents[1] / "scenes" / "textures" / "tiles.png")
-USES = {"global": {}, "caustic": {"map": "caustic"}, "final gather": {"final_gather": True}}
+USES = {
+    "global": {"map": "global"},
+    "caustic": {"map": "caustic"},
+    "final gather": {"final_gather": True},
+}
 # Small against the room (2 units): kernel blur moves light by less than the tolerance.
 PHOTON_MAPPER = {"type": "aniso_pm", "initial_radius": 0.01, "alpha": 1.0, "photon_count": 200_000}
 SIZE = 16

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 from rooms import room_with_plate
 
-SMALL = {"type": "aniso_pm", "photon_count": 3000, "initial_radius": 0.15}
+SMALL = {"type": "aniso_pm", "map": "global", "photon_count": 3000, "initial_radius": 0.15}
 
 
 def integrator(**parameters):

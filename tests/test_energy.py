@@ -15,7 +15,7 @@ from rooms import ROOMS
 from rooms import room as empty_room
 
 # Small against the room (2 units): kernel blur moves light by less than the tolerance.
-PHOTON_MAPPER = {"type": "aniso_pm", "initial_radius": 0.01, "alpha": 1.0}
+PHOTON_MAPPER = {"type": "aniso_pm", "map": "global", "initial_radius": 0.01, "alpha": 1.0}
 KERNELS = {
     "isotropic": {"kernel": "isotropic"},
     "lobe": {"rule": "lobe"},
@@ -230,6 +230,7 @@ def furnace(edge_compensation, albedo=0.5, radius=0.2):
             "type": "scene",
             "integrator": {
                 "type": "aniso_pm",
+                "map": "global",
                 "initial_radius": radius,
                 "photon_count": 200_000,
                 "edge_compensation": edge_compensation,
@@ -278,7 +279,12 @@ def test_kernel_normalisation_is_exact_on_a_curved_surface():
     scene = mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "aniso_pm", "initial_radius": 0.05, "photon_count": 300_000},
+            "integrator": {
+                "type": "aniso_pm",
+                "map": "global",
+                "initial_radius": 0.05,
+                "photon_count": 300_000,
+            },
             "sensor": {
                 "type": "perspective",
                 "fov": 60,

@@ -7,7 +7,11 @@ import pytest
 from aniso_pm import emission
 from energy import indirect
 
-USES = {"global": {}, "caustic": {"map": "caustic"}, "final gather": {"final_gather": True}}
+USES = {
+    "global": {"map": "global"},
+    "caustic": {"map": "caustic"},
+    "final gather": {"final_gather": True},
+}
 
 
 def axis(*v):
@@ -100,11 +104,11 @@ def test_indirect_light_of_a_turned_environment_map_agrees_with_path(variants_al
         values = [indirect(scene, integrator, -1, spp, seed).mean() for seed in range(seeds)]
         return np.mean(values), np.std(values, ddof=1) / seeds**0.5
 
-    reference, noise = mean({"type": "path"}, 32768, 16)
+    reference, noise = mean({"type": "path"}, 32768, 8)
     for use, more in USES.items():
         passes = 16 if mi.is_spectral else 1
-        small = {"initial_radius": 0.02, "photon_count": 400_000, "passes": passes}
-        energy, own = mean({"type": "aniso_pm"} | small | more, 1024, 8)
+        small = {"initial_radius": 0.01, "photon_count": 3_200_000 // passes, "passes": passes}
+        energy, own = mean({"type": "aniso_pm"} | small | more, 4096, 8)
         error = np.hypot(noise, own) / reference
         print(f"{variants_all} {turn} {use}: {energy / reference:.4f} ± {error:.4f}", flush=True)
         assert error < 0.003

@@ -10,7 +10,7 @@ from aniso_pm import cli
 from aniso_pm.explain import explain
 from rooms import room, room_with_plate
 
-OURS = {"type": "aniso_pm", "photon_count": 20_000, "initial_radius": 0.15}
+OURS = {"type": "aniso_pm", "map": "global", "photon_count": 20_000, "initial_radius": 0.15}
 
 
 @pytest.fixture(autouse=True)
@@ -98,11 +98,11 @@ def test_the_maps_radiance_is_what_rendering_adds_to_direct_light():
 
     def render(**parameters):
         plugin = mi.load_dict(OURS | {"photon_count": 300_000} | parameters)
-        return np.array(mi.render(scene, integrator=plugin, spp=2048, seed=0))
+        return np.array(mi.render(scene, integrator=plugin, spp=32768, seed=0))
 
     indirect = render() - render(max_depth=2)
     for pixel in ((1, 4), (4, 2)):
-        found = explained(definition, pixel, photon_count=300_000, samples=2048)
+        found = explained(definition, pixel, photon_count=300_000, samples=8192)
         # Photons of the same pass: what differs is where in the pixel the eye samples are.
         np.testing.assert_allclose(found.pixel_radiance, indirect[pixel[1], pixel[0]], rtol=0.03)
 

@@ -17,7 +17,10 @@ def _variant(variant_llvm_rgb):
 
 def findings(name, **settings):
     scene = matrix.make(matrix.rows()[name], size=4)
-    return {f.name: f for f in inspect.examine(prepare(scene, Settings(**settings), False))}
+    return {
+        f.name: f
+        for f in inspect.examine(prepare(scene, Settings(**{"map": "global"} | settings), False))
+    }
 
 
 def test_a_diffuse_room_needs_nothing_but_the_map():
@@ -119,7 +122,7 @@ def test_the_command_prints_the_same_as_text_and_json(tmp_path, capsys):
 def test_what_is_left_out_is_not_compiled():
     def sizes(name, **settings):
         scene = matrix.make(matrix.rows()[name], size=4)
-        found = inspect.kernels(prepare(scene, Settings(**settings), False))
+        found = inspect.kernels(prepare(scene, Settings(**{"map": "global"} | settings), False))
         lines = (line.split() for line in found.evidence)
         return {words[0]: int(words[3].replace(",", "")) for words in lines}
 

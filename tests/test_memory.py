@@ -16,7 +16,7 @@ from aniso_pm.state import Checkpoint
 from rooms import room, room_with_ball, room_with_plate
 
 GIB = memory.GIB
-SMALL = {"type": "aniso_pm", "photon_count": 40_000, "initial_radius": 0.1}
+SMALL = {"type": "aniso_pm", "map": "global", "photon_count": 40_000, "initial_radius": 0.1}
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +47,7 @@ sys.path.insert(0, sys.argv[1])
 import rooms
 name, size, spp, parameters = json.loads(sys.argv[2])
 scene = mi.load_dict(rooms.ROOMS[name](size=size))
-plugin = mi.load_dict({"type": "aniso_pm", "initial_radius": 0.01} | parameters)
+plugin = mi.load_dict({"type": "aniso_pm", "map": "global", "initial_radius": 0.01} | parameters)
 before = int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
 plugin.render(scene, spp=spp)
 # Not ru_maxrss: that of a large parent process survives fork and exec.
@@ -97,7 +97,7 @@ def test_thirty_million_photons_and_a_large_film_fit_into_24_gib():
 
 
 def test_the_bound_of_photons_holds_and_the_measured_number_is_right():
-    scene = prepare(mi.load_dict(room(size=4)), Settings(photon_count=100_000), False)
+    scene = prepare(mi.load_dict(room(size=4)), Settings(map="global", photon_count=100_000), False)
     stored = scene.photon_map(0, 0).stored
     assert 1e5 * pilot.photons_per_path(scene, 0) == pytest.approx(stored, rel=0.02)
     assert stored < 25 * 1e5
@@ -153,7 +153,7 @@ def test_parts_of_the_film_are_the_picture_of_the_whole(monkeypatch, film, sampl
 
 
 def test_small_wavefronts_of_light_paths_leave_the_same_photons():
-    scene = prepare(mi.load_dict(room(size=4)), Settings(photon_count=100_000), False)
+    scene = prepare(mi.load_dict(room(size=4)), Settings(map="global", photon_count=100_000), False)
     whole = scene.photon_map(0, 0)
     parts = memory.replace(scene, light_wavefront=1 << 14).photon_map(0, 0)
     assert parts.emitted == whole.emitted

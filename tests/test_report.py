@@ -292,7 +292,7 @@ def test_budgets_span_two_decades():
 
 
 def stage_of(world, photons=30_000):
-    return runs.Stage(world, world.sensors()[0], {}, {}, photons, 1)
+    return runs.Stage(world, world.sensors()[0], {"map": "global"}, {}, photons, 1)
 
 
 @pytest.mark.parametrize("dark", [1.0, 0.9])

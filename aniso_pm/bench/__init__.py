@@ -3,8 +3,8 @@
 Speeds are ratios within one run wherever that is possible: the machine they were measured on is
 then of little importance. A module of measurements is one idea and has a function
 ``measure(quick)`` that yields rows: ``gathering`` and its data (``walls``) and rivals (``grid``),
-``building``, ``tracing``, ``passes``, ``memory``, ``startup``, ``kernels``. ``row`` says what a row
-is and prints it, ``timing`` takes the time, ``rooms`` has the scenes.
+``building``, ``tracing``, ``passes``, ``memory``, ``startup``, ``kernels``, ``errors``. ``row``
+says what a row is and prints it, ``timing`` takes the time, ``rooms`` has the scenes.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ GROUPS = {
     "memory": "memory",
     "startup": "startup",
     "kernels": "kernels",
+    "error": "errors",
 }
 
 

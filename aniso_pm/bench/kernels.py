@@ -16,6 +16,7 @@ def hashes(scene, kernel: str) -> set[str]:
     """Of all kernels of a small rendering of the scene."""
     integrator = {
         "type": "aniso_pm",
+        "map": "global",
         "kernel": kernel,
         "photon_count": 4096,
         "initial_radius": 0.1,

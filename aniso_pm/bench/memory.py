@@ -97,7 +97,7 @@ def map_memory(light_paths: int) -> dict[str, Any]:
     from . import rooms
 
     scene = mi.load_dict(rooms.room(16))
-    prepared = prepare(scene, Settings(photon_count=light_paths, max_depth=6), False)
+    prepared = prepare(scene, Settings(map="global", photon_count=light_paths, max_depth=6), False)
     # Compilers need memory of their own: once, for kernels, not for photons.
     prepared.with_(photon_count=1024).photon_map(0, 0)
 
@@ -129,6 +129,7 @@ def large_memory() -> dict[str, Any]:
     scene = mi.load_dict(rooms.room(4096))
     integrator = {
         "type": "aniso_pm",
+        "map": "global",
         "photon_count": 8_000_000,
         "initial_radius": 0.002,
         "max_depth": 6,

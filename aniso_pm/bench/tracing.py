@@ -29,7 +29,7 @@ def measure(quick: bool) -> Iterator[Row]:
 
 
 def _against_path(name: str, scene, count: int, repetitions: int) -> Row:
-    settings = Settings(photon_count=count, max_depth=DEPTH, rr_depth=ROULETTE)
+    settings = Settings(map="global", photon_count=count, max_depth=DEPTH, rr_depth=ROULETTE)
     prepared = prepare(scene, settings, False)
     stored = prepared.photon_map(0, 0).stored
     path = mi.load_dict({"type": "path", "max_depth": DEPTH, "rr_depth": ROULETTE})

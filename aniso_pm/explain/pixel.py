@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import density, eye, film, photons
+from .. import density, eye, film, footprint, photons
 from ..kernel import kernel_axes, project_to_plane
 from ..ndf import read_roughness
 from ..needs import describe
@@ -71,6 +71,9 @@ def explain(
     count, radius0 = settle(prepared, sensor, seed, each * pixels, *wanted)
     # Photon by photon, so that those that are shown are those that are summed.
     prepared = prepared.with_(photon_count=count, gather_tolerance=0.0)
+    if not settings.initial_radius:
+        pixel_width = footprint.in_pass(footprint.of(sensor, radius0), pass_index)
+        prepared = replace(prepared, footprint=pixel_width)
     radius = bandwidth(radius0, settings.alpha, pass_index)
     colour = wavelength_sample(seed, pass_index)
     wavelengths = film.wavelengths(sensor, colour) if mi.is_spectral else None
@@ -133,6 +136,8 @@ def explain(
         path = vertices.path(sample, scene, ())
         return replace(found, sentence=f"eye path {sample} reads no photon map", path=path)
     point = eye.take(points, mi.UInt32(chosen))
+    radius = float(dr.mean(prepared.bandwidth(point, mi.Float(radius)))[0])
+    found = replace(found, radius=radius)
     kernel, lobe, outlines = _kernel(prepared, point, radius, bool(lost[chosen]))
     lane = int(lanes[chosen])
     return replace(

@@ -68,13 +68,14 @@ def relative_rmse(difference: np.ndarray, reference: np.ndarray) -> float:
 
 
 def depends_on(world, sensor) -> dict[str, Any]:
-    """What a reference depends on, entry by entry (see ``digest``): the scene, camera and film, the
-    colours of the variant, and which paths the scene's own integrator counts."""
+    """What a reference depends on, entry by entry (see ``digest``): the scene, camera and film (no
+    converged picture depends on a sampler), the colours of the variant, and which paths the scene's
+    own integrator counts."""
     limits = path_limits(world.integrator())
     return {
         "colours": "mono" if mi.is_monochromatic else "spectral" if mi.is_spectral else "rgb",
         **{f'parameter "{name}"': value for name, value in limits.items()},
-        **digest.camera_entries(sensor),
+        **digest.camera_entries(sensor, with_sampler=False),
         **digest.scene_entries(world),
     }
 

@@ -21,7 +21,7 @@ from .worlds import Place, ball, diffuse, film, grey, mesh, plate, room
 FALLBACKS = ("clamped", "capped", "degenerate")
 # Energy: 1 % of closed rooms is what the energy tests allow; Monte Carlo errors below 0.5 %.
 ENERGY = 0.02
-_OURS = {"type": "aniso_pm", "photon_count": 50_000}
+_OURS = {"type": "aniso_pm", "map": "global", "photon_count": 50_000}
 GLASS = {"type": "dielectric", "int_ior": 1.5}
 
 
