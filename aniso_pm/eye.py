@@ -37,30 +37,25 @@ class Thinning:
     chance, so that the mean is right, and of any number of consecutive samples that share within
     one or two, however they are spread over wavefronts and passes.
 
-    share         of the paths, above 0 and at most 1.
-    seed          of the choice.
-    first_pixel   pixel of the first lane, first_sample its number among the pixel's samples.
-    samples       consecutive lanes of a pixel.
+    share   of the paths, above 0 and at most 1.
+    seed    of the choice.
+    pixel   of each lane; sample: its number among the pixel's samples.
     """
 
     share: Any
     seed: Any
-    first_pixel: Any
-    first_sample: Any
-    samples: Any
+    pixel: Any
+    sample: Any
 
     @staticmethod
-    def of(share: float, seed: int, first_pixel: int, first_sample: int, samples: int) -> Thinning:
+    def of(share: float, seed: int, pixel, sample) -> Thinning:
         """For one wavefront."""
-        numbers = (seed, first_pixel, first_sample, samples)
-        return Thinning(dr.opaque(mi.Float, share), *(dr.opaque(mi.UInt32, n) for n in numbers))
+        return Thinning(dr.opaque(mi.Float, share), dr.opaque(mi.UInt32, seed), pixel, sample)
 
-    def chosen(self, lane):
-        """Does the path gather?"""
-        pixel = lane // self.samples
-        sample = self.first_sample + lane - pixel * self.samples
-        start, _ = mi.sample_tea_32(pixel + self.first_pixel, self.seed)
-        u = mi.Float((sample * 0x9E3779B9 + start) >> 8) * 2.0**-24
+    def chosen(self):
+        """Does the path of each lane gather?"""
+        start, _ = mi.sample_tea_32(self.pixel, self.seed)
+        u = mi.Float((self.sample * 0x9E3779B9 + start) >> 8) * 2.0**-24
         return u < self.share
 
 
@@ -252,7 +247,7 @@ def _walk(scene, sampler, ray, options, push, see):
     distance = mi.Float(0)  # Length of the path
     chosen, worth = mi.Bool(True), mi.Float(1)  # Does the path gather, and for how many others?
     if dr.hint(o.thinning is not None, mode="scalar"):
-        chosen, worth = o.thinning.chosen(lane), dr.rcp(o.thinning.share)
+        chosen, worth = o.thinning.chosen(), dr.rcp(o.thinning.share)
 
     while dr.hint(active, label="eye paths"):
         # --- Find the next vertex ---

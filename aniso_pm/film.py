@@ -11,19 +11,18 @@ import mitsuba as mi
 
 def pixel_count(film) -> int:
     """Pixels that are sampled: the crop window, plus the filter's border if the film wants it."""
-    width, height = _sampled_size(film)
+    width, height = sampled_size(film)
     return width * height
 
 
-def sample_rays(sensor, sampler, spp, wavelength, first=0, pixels=None):
-    """Camera rays of one wavefront: (ray, weight, position on the film), spp samples a pixel in
-    consecutive lanes. wavelength: the sample in [0, 1) that chooses wavelengths
-    for all of them. first, pixels: of which pixels, row by row; None: all from the first on."""
+def sample_rays(sensor, sampler, pixel, wavelength):
+    """Camera rays of one wavefront: (ray, weight, position on the film).
+
+    pixel       of each lane, row by row through the pixels that are sampled.
+    wavelength  the sample in [0, 1) that chooses wavelengths for all of them.
+    """
     film = sensor.film()
-    width, height = _sampled_size(film)
-    pixels = width * height - first if pixels is None else pixels
-    lane = dr.arange(mi.UInt32, pixels * spp)
-    pixel = lane // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first)
+    width, _ = sampled_size(film)
     row = pixel // width
     corner = mi.Point2i(mi.Int32(pixel - row * width), mi.Int32(row)) - _border(film)
     corner += mi.Point2i(mi.ScalarPoint2i(film.crop_offset()))
@@ -55,10 +54,14 @@ def wavelengths(sensor, u):
     return ray.wavelengths
 
 
-def splat(film, position, radiance, valid, spp, wavelengths):
+def splat(film, position, radiance, valid, spp, wavelengths, weight=None):
     """One wavefront of samples as the film's own storage has it: TensorXf (height, width,
-    channels), weighted by the reconstruction filter, the weight in the last channel. valid: alpha
-    is 1 there, else 0."""
+    channels), weighted by the reconstruction filter, the weight in the last channel.
+
+    valid   alpha is 1 there, else 0.
+    spp     samples of a pixel that lie next to each other, in the mean.
+    weight  of each sample beside the filter's; None: 1.
+    """
     block = film.create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
     alpha = dr.select(valid, mi.Float(1), mi.Float(0))
@@ -76,6 +79,8 @@ def splat(film, position, radiance, valid, spp, wavelengths):
         if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
             channels.append(alpha)
         channels.append(mi.Float(1))
+    if weight is not None:
+        channels = [channel * weight for channel in channels]
     block.put(position, channels)
     image = block.tensor()
     dr.eval(image)
@@ -141,6 +146,7 @@ def _border(film) -> int:
     return film.rfilter().border_size() if film.sample_border() else 0
 
 
-def _sampled_size(film) -> tuple[int, int]:
+def sampled_size(film) -> tuple[int, int]:
+    """(width, height) of the pixels that are sampled."""
     width, height = film.crop_size()
     return width + 2 * _border(film), height + 2 * _border(film)

@@ -1,54 +1,69 @@
 """How wide a pixel is where an eye path reads the photon map, and what that means for kernels.
 
-Light that changes within a pixel's footprint is averaged anyway, so a kernel narrower than that
-only sees fewer photons; one much wider blurs. With f the footprint at a gather point (world units,
-the width of a pixel there, measured along the path), and r the bandwidth of the pass, the kernel's
-radius is
+With f the footprint of a pixel at a gather point (world units, its width there, measured along the
+path), w the width of the kernel in pixels (``survey`` finds it pixel by pixel), and r_i the
+bandwidth of pass i (0-based, see ``schedule``), the kernel's radius is
 
-    r(p) = clip(1.75 f r_i/r_0, l_i r_i, r_i),      l_i = max(1/(i + 1), 1/5),
+    r(p) = clip(w f r_i/r_0, l_i r_i, r_i),      l_i = 1/max(M, i + 1),
 
-r_i the bandwidth of pass i (0-based). The first pass has r_0 everywhere, and all passes together
-have at least its photons in every kernel. The schedule of the passes shrinks all of it alike, so
-that the mean over passes converges as before; r_i is a function of i alone.
-
-On the gallery the best single radius is 1.3 to 2.6 footprints, whatever the density of photons.
+M the number of passes, 16 where it is open. So all passes together hold at least the photons of a
+kernel of r_0. Everything shrinks alike from pass to pass, so that the mean over passes converges as
+with one radius; r_i and l_i are functions of i and the parameters alone.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-# Kernel radius in widths of a pixel.
-WIDTHS = 1.75
-# Least share of a pass's bandwidth, however late the pass.
-LEAST = 0.2
+# Passes that are reckoned with where their number is open.
+OPEN = 16
 
 
 @dataclass  # not frozen: Dr.Jit traverses it
 class Footprint:
     """Bandwidth of a gather point as a share of that of its pass.
 
-    start   at the camera; ``spread`` per world unit of path.
+    start   width of a pixel at the camera, ``spread`` per world unit of path, both as a share of
+            r_0.
     least   smallest share in this pass, above 0 and at most 1.
+    widths  of kernels in pixels: one number, or one for each pixel.
+    pixel   of each eye path; None where there is one width.
     """
 
     start: Any
     spread: Any
     least: Any
+    widths: Any
+    pixel: Any = None
 
-    def share(self, distance):
-        """Of a gather point that is ``distance`` world units of path from the camera."""
-        return dr.clip(dr.fma(self.spread, distance, self.start), self.least, 1)
+    def share(self, distance, lane):
+        """Of a gather point of eye path ``lane``, ``distance`` world units of path from the
+        camera."""
+        width = self.widths
+        if self.pixel is not None:
+            width = dr.gather(mi.Float, width, dr.gather(mi.UInt32, self.pixel, lane))
+        return dr.clip(width * dr.fma(self.spread, distance, self.start), self.least, 1)
+
+    def in_pass(self, index: int, passes: int) -> Footprint:
+        """The same in pass ``index`` (0-based) of ``passes``, 0 if their number is open."""
+        return replace(self, least=dr.opaque(mi.Float, least_share(index, passes)))
+
+    def seen_by(self, pixel) -> Footprint:
+        """The same for eye paths of these pixels (UInt32)."""
+        return replace(self, pixel=pixel) if dr.width(self.widths) > 1 else self
 
 
-def of(sensor, radius: float) -> Footprint:
-    """Footprints of the pixels of a sensor, seen in its middle, for the first pass.
+def of(sensor, radius: float, widths=1.0) -> Footprint:
+    """Footprints of the pixels of a sensor, seen in its middle; kernels that are never narrower
+    until ``in_pass`` says by how much.
 
-    radius  bandwidth of the first pass, world units.
+    radius  bandwidth r_0 of the first pass, world units.
+    widths  of kernels in pixels: a number or a flat array, one for each sampled pixel.
     """
     centre, aperture = mi.Point2f(0.5), mi.Point2f(0.5)
     time = mi.Float(sensor.shutter_open())
@@ -60,19 +75,11 @@ def of(sensor, radius: float) -> Footprint:
         beside, _ = sensor.sample_ray(time, mi.Float(0.5), centre + step, aperture)
         start = dr.maximum(start, dr.norm(beside.o - ray.o))
         spread = dr.maximum(spread, dr.norm(beside.d - ray.d))
-    scale = WIDTHS / radius
-    found = Footprint(start * scale, spread * scale, mi.Float(1))
-    dr.make_opaque(found.start, found.spread, found.least)
+    found = Footprint(start / radius, spread / radius, mi.Float(1), mi.Float(widths))
+    dr.make_opaque(found.start, found.spread, found.least, found.widths)
     return found
 
 
-def in_pass(footprint: Footprint | None, index: int) -> Footprint | None:
-    """The same in pass ``index`` (0-based); None stays None."""
-    if footprint is None:
-        return None
-    return replace(footprint, least=dr.opaque(mi.Float, least_share(index)))
-
-
-def least_share(index: int) -> float:
-    """Smallest share of the bandwidth of pass ``index`` (0-based) that a kernel may have."""
-    return max(1 / (index + 1), LEAST)
+def least_share(index: int, passes: int) -> float:
+    """Smallest share of the bandwidth of a pass that a kernel may have."""
+    return 1 / max(passes or OPEN, index + 1)

@@ -1,6 +1,6 @@
 """The bandwidth of the first pass, from a small pilot of photons and eye paths.
 
-Every eye path that reaches a receiver widens its disc by factors of √2 until it holds enough pilot
+Every eye path that reaches a receiver widens its disc by factors of 2 until it holds enough pilot
 photons. A median of these radii, scaled to the photons of a full pass, is the bandwidth: robust
 from a coin to a stadium, because it looks at the densities where the camera does. Each point counts
 by the light that it receives: a caustic on a dark floor sets the bandwidth, not the floor.
@@ -9,13 +9,14 @@ by the light that it receives: a caustic on a dark floor sets the bandwidth, not
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import density
-from .film import rays_through, wavelengths
+from . import density, photons, survey
+from .film import wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 
 # Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
@@ -24,11 +25,10 @@ PHOTONS_PER_KERNEL = 60
 FEWEST, MOST = 10_000, 5_000_000
 # Light paths and eye paths of the pilot, and photons that a disc must hold to be measured.
 _PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
-# Smallest share of eye paths that gather, smallest number of them in a pixel and pass, and the work
-# of an eye path and the photons of a pass without gathering.
-_LEAST_SHARE, _GATHERS_PER_PIXEL, _REST = 1 / 8, 2, 1.5
-# Range of radii as shares of the scene's extent: 1e-5 · √2^27 = 0.1.
-_SMALLEST, LARGEST, _STEPS = 1e-5, 0.1, 27
+# Light paths for which the bandwidth is chosen before their number is.
+USUAL = 250_000
+# Range of radii as shares of the scene's extent: 1.2e-5 · 2^13 = 0.1.
+_SMALLEST, LARGEST, _STEPS = 1.2e-5, 0.1, 14
 
 
 def camera_rays(sensor, seed: int):
@@ -42,65 +42,52 @@ def camera_rays(sensor, seed: int):
     return ray
 
 
-def settle(scene: Prepared, sensor, seed: int, samples: int, count=None, radius=None):
-    """(light paths per pass, bandwidth of the first pass): what is not given is chosen.
+@dataclass(frozen=True)
+class Settled:
+    """What a rendering needs to know before its first pass, given or chosen.
 
-    samples: eye samples of a pass.
+    count   light paths per pass.
+    radius  bandwidth of the first pass, world units.
+    share   of the eye paths that gather (see ``eye.Thinning``).
+    counts  samples of each pixel in a pass (see ``allotment``), or None: all alike.
+    widths  of the kernels of each pixel, in pixels (see ``footprint``).
     """
-    if not count or not radius:
-        rays = camera_rays(sensor, seed)
-        count = count or automatic_photon_count(scene, rays, seed, samples)
-        radius = radius or automatic_radius(scene.with_(photon_count=count), rays, seed)
-    return count, radius
+
+    count: int
+    radius: float
+    share: float
+    counts: np.ndarray | None
+    widths: np.ndarray
 
 
-def share_of_gathers(scene: Prepared, sensor, radius: float, seed: int, samples: int) -> float:
-    """Share of the eye paths that gather (see ``eye.Thinning``), from pairs of eye paths in pixels.
+def settle(scene: Prepared, sensor, seed: int, each: int, count=None, radius=None) -> Settled:
+    """What is not given is chosen, by a function of scene, parameters and seed.
 
-    With the variance V_g of what is gathered and V_r of all the rest within a pixel, and the work
-    C_g of a gather and C_r of everything else for an eye path, variance times work,
-    (V_r + V_g/q)(C_r + q C_g), is smallest at q² = V_g C_r / (V_r C_g). Work is counted.
-
-    samples: eye samples of a pixel in a pass, of which four at least shall gather.
+    each: eye samples of a pixel in a pass.
     """
-    least = max(_LEAST_SHARE, min(1.0, _GATHERS_PER_PIXEL / samples))
-    if least == 1:
-        return 1.0
     colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
     pilot = scene.with_(photon_count=_PATHS)
-    map_ = pilot.photon_map(stream_seed(seed, PILOT), 0, wavelengths=colours)
-    if map_.stored == 0:
-        return 1.0
-    # A pilot's photons are too few for the bandwidth of the pass.
-    wider = math.sqrt(max(1.0, scene.settings.photon_count / map_.emitted))
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(stream_seed(seed, PILOT, 3), _RAYS)
-    size = sensor.film().crop_size()
-    corner = mi.Point2f(mi.ScalarPoint2f(sensor.film().crop_offset()))
-    lane = dr.arange(mi.UInt32, _RAYS // 2)
-    a, b = mi.sample_tea_32(lane, stream_seed(seed, PILOT, 4))
-    pixel = mi.Point2f(a % size[0], b % size[1])
-    pixel = dr.gather(mi.Point2f, pixel, dr.arange(mi.UInt32, _RAYS) // 2)
-    ray, _ = rays_through(sensor, sampler, corner + pixel + sampler.next_2d(), 0.5)
-    L, _, points = scene.trace(sampler, ray)
-    if points is None:
-        return 1.0
-    light = dr.zeros(mi.Float, _RAYS)
-    photons = 0.0
-    r = dr.opaque(mi.Float, wider * radius)
-    for found in scene.gather(map_, r, seed, points, colours):
-        dr.scatter_add(light, dr.mean(found.radiance), found.lane)
-        photons += float(dr.sum(mi.Float(found.photons))[0])
-    gathered = np.nan_to_num(light.numpy()).reshape(-1, 2)
-    rest = np.nan_to_num(dr.mean(L).numpy() + np.zeros(_RAYS)).reshape(-1, 2)
-    level = (gathered + rest).mean(1)
-    weight = 1 / (level**2 + (0.1 * np.quantile(level, 0.5)) ** 2 + 1e-30)
-    within = lambda v: float(np.mean(weight * (v[:, 0] - v[:, 1]) ** 2))  # noqa: E731
-    V_g, V_r = within(gathered), within(rest)
-    C_g = dr.width(points.lane) / _RAYS * (0.8 + photons / dr.width(points.lane) / 40)
-    share = math.sqrt(V_g * _REST / (V_r * C_g)) if V_r > 0 else 1.0
-    # In steps, so that machines whose arithmetic differs in the last digits agree.
-    return min(16, math.ceil(16 * max(least, share))) / 16
+    maps = [
+        pilot.photon_map(stream_seed(seed, PILOT), k, wavelengths=colours) if scene.needs_map
+        else photons.EMPTY
+        for k in (0, 1)
+    ]  # fmt: skip
+    automatic, reference = not radius, count or USUAL
+    if not radius:
+        radius = automatic_radius(
+            scene.with_(photon_count=reference), camera_rays(sensor, seed), seed, maps[0]
+        )
+    found = survey.look(scene, sensor, radius, seed, each, maps, count, automatic)
+    if not count:
+        count = int(min(max(_rounded(found.light_paths), FEWEST), MOST))
+        if automatic:
+            radius = min(radius * math.sqrt(reference / count), LARGEST * scene.extent)
+    return Settled(count, radius, found.share, found.counts, found.widths)
+
+
+def _rounded(number: float) -> int:
+    """To two digits, so that machines whose arithmetic differs in the last ones agree."""
+    return round(number, 1 - int(math.log10(number))) if number >= 1 else 0
 
 
 def _weighted_median(radii) -> float:
@@ -117,15 +104,16 @@ def photons_per_path(scene: Prepared, seed: int) -> float:
     return map_.stored / max(map_.emitted, 1)
 
 
-def automatic_radius(scene: Prepared, rays, seed: int) -> float:
+def automatic_radius(scene: Prepared, rays, seed: int, map_=None) -> float:
     """Bandwidth (world units) at which kernels hold PHOTONS_PER_KERNEL photons in the median.
 
-    rays: any number of camera rays. The seeds are the pilot's own. Returns a hundredth of the
+    rays: any number of camera rays. map_: a pilot's, if there is one. Returns a hundredth of the
     scene's extent where there is nothing to gather, and never more than a tenth of it.
     """
     extent = scene.extent
-    pilot = scene.with_(photon_count=min(scene.settings.photon_count, _PATHS))
-    map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
+    if map_ is None:
+        pilot = scene.with_(photon_count=min(scene.settings.photon_count, _PATHS))
+        map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
     if map_.stored == 0:
         return 0.01 * extent
     count = dr.width(rays)
@@ -145,32 +133,10 @@ def automatic_radius(scene: Prepared, rays, seed: int) -> float:
         exact = radius * dr.sqrt(_ENOUGH / mi.Float(dr.maximum(found, 1)))
         enough = looking & (found >= _ENOUGH)
         looking &= ~enough
-        radius = dr.select(enough, exact, dr.select(looking, radius * math.sqrt(2), radius))
+        radius = dr.select(enough, exact, dr.select(looking, 2 * radius, radius))
         dr.eval(looking, radius)
         if not dr.any(looking):
             break
     median = _weighted_median(radius.numpy())
-    more_photons = scene.settings.photon_count / pilot.settings.photon_count
+    more_photons = scene.settings.photon_count / map_.emitted
     return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), LARGEST * extent)
-
-
-def automatic_photon_count(scene: Prepared, rays, seed: int, eye_samples: int) -> int:
-    """Light paths per pass that are about as much work as its eye samples, two digits.
-
-    Work is counted, not timed, so that every machine chooses the same: one unit for an eye sample
-    and for each of its gather points, one for a light path and for each photon that it leaves. Both
-    means are the pilot's.
-
-    rays: camera rays. eye_samples: of a pass. Returns FEWEST where there is nothing to gather.
-    """
-    pilot = scene.with_(photon_count=_PATHS)
-    map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(stream_seed(seed, PILOT, 1), dr.width(rays))
-    _, _, points = scene.trace(sampler, rays)
-    if points is None or map_.stored == 0:
-        return FEWEST
-    gathers = dr.width(points.lane) / dr.width(rays)
-    balanced = eye_samples * (1 + gathers) / (1 + map_.stored / map_.emitted)
-    digits = 1 - int(math.log10(balanced))
-    return int(min(max(round(balanced, digits), FEWEST), MOST))

@@ -240,7 +240,7 @@ class Prepared:
         """Of each gather point, world units. radius: of the pass."""
         if self.footprint is None:
             return radius
-        return radius * self.footprint.share(points.distance)
+        return radius * self.footprint.share(points.distance, points.lane)
 
     def _gather(self, map_, radius, seed, points, surface) -> density.Gathered:
         radius = self.bandwidth(points, radius)

@@ -20,11 +20,12 @@ import numpy as np
 
 from . import advice, digest, footprint, memory, state
 from . import film as films
+from .allotment import Allotment
 from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .clock import Clock
 from .errors import is_interrupt
 from .eye import Thinning
-from .pilot import photons_per_path, settle, share_of_gathers
+from .pilot import photons_per_path, settle
 from .prepared import EYE, PROBE, THINNING, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
 from .stopping import Stopping
@@ -152,19 +153,17 @@ class _Run:
         known = earlier.identity if earlier else {}
         count = settings.photon_count or known.get("photon count")
         self.radius0 = settings.initial_radius or known.get("initial radius")
-        samples = self.shares.each * films.pixel_count(self.film)
-        count, self.radius0 = settle(
-            self.scene, self.sensor, self.seed, samples, count, self.radius0
-        )
+        each = self.shares.each
+        found = settle(self.scene, self.sensor, self.seed, each, count, self.radius0)
+        count, self.radius0 = found.count, found.radius
+        self.share = known.get("share of gathers") or found.share
+        self.allotment = Allotment(films.pixel_count(self.film), each, found.counts)
         self.scene = self.scene.with_(photon_count=count)
         self.plan = memory.plan(self.scene, *self._job())
         self.scene = replace(self.scene, light_wavefront=self.plan.light_paths)
         if not settings.initial_radius:
-            pixel = footprint.of(self.sensor, self.radius0)
+            pixel = footprint.of(self.sensor, self.radius0, found.widths)
             self.scene = replace(self.scene, footprint=pixel)
-        self.share = known.get("share of gathers") or share_of_gathers(
-            self.scene, self.sensor, self.radius0, self.seed, self.shares.each
-        )
         self.clock.lap("pilot")
         # The response curves of a specfilm do not survive a replay of the scene that they are in.
         special = mi.has_flag(self.film.flags(), mi.FilmFlags.Special)
@@ -296,70 +295,54 @@ class _Run:
 
         # --- Eye paths ---
         share = self.shares(index)
-        for image, taken in self._eye_pass(index, share, colour, counts):
+        for image, done in self._eye_pass(index, share, colour, counts):
             self.unfinished = image, dict(counts)
-            if taken < share:
-                self._report(index, taken / share)
+            if done < 1:
+                self._report(index, done)
         return image, counts
 
     def _eye_pass(self, index, spp, colour, counts):
         """Trace ``spp`` eye samples a pixel against the map, wavefront by wavefront; yields (image
-        so far as film blocks hold it, samples a pixel so far). Where memory is short a wavefront
-        has a part of the pixels, one sample each."""
+        so far as film blocks hold it, share of the pass that is done). Where memory is short a
+        wavefront has a part of the pixels, one sample each."""
         scene, sensor, map_ = self.scene, self.sensor, self.map
-        film = sensor.film()
-        pixels = films.pixel_count(film)
-        per_wavefront = self._samples_at_once(spp)
-        at_once = pixels
-        if pixels * per_wavefront > self.plan.eye_samples:
-            per_wavefront = max(1, self.plan.eye_samples // pixels)
-            at_once = min(pixels, self.plan.eye_samples)
+        film, pixels = sensor.film(), self.allotment.pixels
+        most = min(max(pixels, WAVEFRONT // scene.crowding), self.plan.eye_samples)
         # An array, not a number: as a literal it would make every pass compile kernels of its own.
         radius = dr.opaque(mi.Float, self.radius)
-        scene = replace(scene, footprint=footprint.in_pass(scene.footprint, index))
+        pixel = scene.footprint and scene.footprint.in_pass(index, scene.settings.passes)
+        sampler = mi.load_dict({"type": "owen_sobol"})
+        each, before = self.allotment.each, self.shares.before(index) - index * self.allotment.each
         image = None
-        taken = wavefront = 0
-        while taken < spp:
-            for first in range(0, pixels, at_once):
-                some = min(at_once, pixels - first)
-                count = min(per_wavefront, spp - taken)
-                sampler = mi.load_dict({"type": "owen_sobol", "sample_count": count})
-                sampler.first_pixel = first
-                sampler.first_sample = self.shares.before(index) + taken
-                sampler.seed(stream_seed(self.seed, EYE), some * count)
-                thinning = None
-                if self.share < 1:
-                    random = stream_seed(self.seed, THINNING)
-                    begin = sampler.first_sample
-                    thinning = Thinning.of(self.share, random, first, begin, count)
+        parts = self.allotment.wavefronts(index, spp - each, before, most)
+        for wavefront, (lanes, done) in enumerate(parts):
+            sampler.begin(stream_seed(self.seed, EYE), lanes.pixel, lanes.sample)
+            ray, ray_weight, position = films.sample_rays(sensor, sampler, lanes.pixel, colour)
+            dr.eval(ray, ray_weight, position)
+            thinning = None
+            if self.share < 1:
+                random = stream_seed(self.seed, THINNING)
+                thinning = Thinning.of(self.share, random, lanes.pixel, lanes.sample)
 
-                # --- Eye paths and density estimation ---
-                ray, ray_weight, position = films.sample_rays(
-                    sensor, sampler, count, colour, first, some
-                )
-                dr.eval(ray, ray_weight, position)
-                seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
-                room = self.points.room
-                seen = scene.radiance(
-                    sampler, ray, map_, radius, seed, room, self.clock.lap, thinning
-                )
-                self._count(seen.gathered, counts)
+            # --- Eye paths and density estimation ---
+            if pixel is not None:
+                scene = replace(scene, footprint=pixel.seen_by(lanes.pixel))
+            seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
+            room = self.points.room
+            seen = scene.radiance(sampler, ray, map_, radius, seed, room, self.clock.lap, thinning)
+            self._count(seen.gathered, counts)
 
-                # --- Into the image ---
-                finite = dr.all(dr.isfinite(seen.L))
-                counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
-                L = dr.select(finite, seen.L, 0) * ray_weight
-                splats = films.splat(film, position, L, seen.valid, count, ray.wavelengths)
-                image = splats if image is None else image + splats
-                dr.eval(image)
-                self.clock.lap("film")
-                counts["eye_samples"] += some * count
-                wavefront += 1
-                part = (first + some) / pixels
-                if part == 1:
-                    counts["spp"] += count
-                yield image, min(taken + part * count, spp)
-            taken += count
+            # --- Into the image ---
+            finite = dr.all(dr.isfinite(seen.L))
+            counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
+            L = dr.select(finite, seen.L, 0) * ray_weight
+            splats = films.splat(film, position, L, seen.valid, each, ray.wavelengths, lanes.weight)
+            image = splats if image is None else image + splats
+            dr.eval(image)
+            self.clock.lap("film")
+            counts["eye_samples"] += lanes.count
+            counts["spp"] = int(spp * done)
+            yield image, done
 
     def _count(self, gathered, counts):
         for found in gathered:

@@ -25,7 +25,7 @@ class Settings:
     map: str = "auto"
     final_gather: bool = False
     gather_roughness: float = 0.2
-    photon_count: int = 250_000
+    photon_count: int = 0
     passes: int = 1
     time: float = 0.0
     target_error: float = 0.0

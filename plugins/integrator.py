@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm import progressive
-from aniso_pm.pilot import automatic_photon_count, automatic_radius
+from aniso_pm.pilot import USUAL, automatic_radius
 from aniso_pm.prepared import Unsupported, prepare
 from aniso_pm.settings import Settings
 from aniso_pm.state import Checkpoint
@@ -283,8 +283,7 @@ class AnisoPhotonMapper:
                     "one that draws wavelengths of its own; render with it directly"
                 )
             if self.settings.photon_count == 0:
-                count = automatic_photon_count(prepared, ray, seed, dr.width(ray))
-                prepared = prepared.with_(photon_count=count)
+                prepared = prepared.with_(photon_count=USUAL)
             radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
             left = (scene, prepared, prepared.photon_map(seed, 0), radius)
         _, prepared, map_, radius = left

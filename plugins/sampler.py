@@ -25,9 +25,9 @@ class OwenSobol:
 
     Pairs of dimensions are (0, 2)-sequences in base 2, shuffled and scrambled for every pixel and
     pair by hashes [Burley 2020]: every power of two of consecutive samples is stratified, and the
-    sequence has no end. ``advance`` goes on with it. In Python the attributes ``first_pixel`` and
-    ``first_sample``, set before ``seed``, begin elsewhere: the sequence of a pixel can be taken in
-    parts, by one process or by several.
+    sequence has no end. ``advance`` goes on with it. In Python ``begin`` takes the place of
+    ``seed`` where lanes shall stand for other pixels and samples: the sequence of a pixel can be
+    taken in parts, by one process or by several.
 
     .. tabs::
         .. code-tab:: xml
@@ -49,7 +49,6 @@ class OwenSobol:
         self._base_seed = int(props.get("seed", 0))
         self._per_wavefront = 0  # as many as sample_count
         self._width = 0
-        self.first_pixel = self.first_sample = 0
         self.index = mi.UInt32(0)  # Of the sample in its pixel's sequence
         self.random = mi.UInt32(0)  # Of the pixel
         self.dimension = mi.UInt32(0)
@@ -64,7 +63,6 @@ class OwenSobol:
     def clone(self):
         made = self.fork()
         made._width = self._width
-        made.first_pixel, made.first_sample = self.first_pixel, self.first_sample
         made.index, made.random = mi.UInt32(self.index), mi.UInt32(self.random)
         made.dimension = mi.UInt32(self.dimension)
         return made
@@ -87,8 +85,12 @@ class OwenSobol:
         lane = dr.arange(mi.UInt32, self._width)
         each = dr.opaque(mi.UInt32, self._each)
         pixel = lane // each
-        self.index = lane - pixel * each + dr.opaque(mi.UInt32, self.first_sample)
-        pixel += dr.opaque(mi.UInt32, self.first_pixel)
+        self.begin(seed, pixel, lane - pixel * each)
+
+    def begin(self, seed, pixel, sample):
+        """Each lane at sample number ``sample`` of the sequence of its ``pixel`` (UInt32)."""
+        self._width = max(dr.width(pixel), dr.width(sample))
+        self.index = mi.UInt32(sample)
         self.random = mi.sample_tea_32(pixel, mi.UInt32(seed) + self._base_seed)[0]
         self.dimension = mi.UInt32(0)
         dr.eval(self.index, self.random)

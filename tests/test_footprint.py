@@ -47,18 +47,12 @@ def test_of_a_pixels_samples_the_same_number_gathers(variant_llvm_rgb):
     pixels, samples = 4096, 16
     lane = dr.arange(mi.UInt32, pixels * samples)
     for share in (0.125, 0.25, 0.6):
-        chosen = eye.Thinning.of(share, 5, 0, 0, samples).chosen(lane).numpy()
+        chosen = eye.Thinning.of(share, 5, lane // samples, lane % samples).chosen().numpy()
         chosen = chosen.reshape(pixels, samples)
         assert (abs(chosen.sum(1) - share * samples) < 2).all()
         # Each sample with the same chance: five standard deviations of 4096 draws.
         spread = 5 * (share * (1 - share) / pixels) ** 0.5
         assert (abs(chosen.mean(0) - share) < spread).all()
-
-
-def test_the_choice_does_not_depend_on_wavefronts(variant_llvm_rgb):
-    whole = eye.Thinning.of(0.3, 5, 0, 0, 8).chosen(dr.arange(mi.UInt32, 24)).numpy().reshape(3, 8)
-    part = eye.Thinning.of(0.3, 5, 1, 6, 2).chosen(dr.arange(mi.UInt32, 4)).numpy().reshape(2, 2)
-    np.testing.assert_array_equal(part, whole[1:, 6:])
 
 
 def test_thinned_gathers_have_the_same_mean(variant_llvm_rgb):

@@ -9,9 +9,9 @@ from scipy.stats import qmc
 
 def points(pixels, samples, seed=3, first_sample=0, first_pixel=0, skip=0):
     """(pixels, samples, 2) of one pair of dimensions, after ``skip`` pairs."""
-    sampler = mi.load_dict({"type": "owen_sobol", "sample_count": samples})
-    sampler.first_sample, sampler.first_pixel = first_sample, first_pixel
-    sampler.seed(seed, pixels * samples)
+    sampler = mi.load_dict({"type": "owen_sobol"})
+    lane = dr.arange(mi.UInt32, pixels * samples)
+    sampler.begin(seed, lane // samples + first_pixel, lane % samples + first_sample)
     for _ in range(skip):
         sampler.next_2d()
     return np.array(sampler.next_2d()).T.reshape(pixels, samples, 2)

@@ -68,12 +68,16 @@ def explain(
     pixels = film.pixel_count(sensor.film())
     each = shares(settings, spp, pixels).each
     wanted = settings.photon_count or None, settings.initial_radius or None
-    count, radius0 = settle(prepared, sensor, seed, each * pixels, *wanted)
+    settled = settle(prepared, sensor, seed, each, *wanted)
+    count, radius0 = settled.count, settled.radius
     # Photon by photon, so that those that are shown are those that are summed.
     prepared = prepared.with_(photon_count=count, gather_tolerance=0.0)
     if not settings.initial_radius:
-        pixel_width = footprint.in_pass(footprint.of(sensor, radius0), pass_index)
-        prepared = replace(prepared, footprint=pixel_width)
+        width = settled.widths.reshape(film.sampled_size(sensor.film())[::-1])
+        border = (width.shape[1] - sensor.film().crop_size().x) // 2
+        row, column = (pixel[k] - sensor.film().crop_offset()[k] + border for k in (1, 0))
+        seen = footprint.of(sensor, radius0, float(width[row, column]))
+        prepared = replace(prepared, footprint=seen.in_pass(pass_index, settings.passes))
     radius = bandwidth(radius0, settings.alpha, pass_index)
     colour = wavelength_sample(seed, pass_index)
     wavelengths = film.wavelengths(sensor, colour) if mi.is_spectral else None

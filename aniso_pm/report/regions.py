@@ -52,7 +52,8 @@ def _look(prepared: Prepared, sensor, seed: int) -> tuple[np.ndarray, np.ndarray
     sampler.set_samples_per_wavefront(spp)
     pixels = films.pixel_count(film)
     sampler.seed(seed, pixels * spp)
-    ray, _, position = films.sample_rays(sensor, sampler, spp, 0.5)
+    lane = dr.arange(mi.UInt32, pixels * spp)
+    ray, _, position = films.sample_rays(sensor, sampler, lane // spp, 0.5)
     corner = film.crop_offset()
     width, height = film.crop_size()
     x = np.floor(position.x.numpy()).astype(int) - corner[0]
