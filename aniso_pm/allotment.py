@@ -55,7 +55,7 @@ class Allotment:
         before  such samples in all passes before.
         most    lanes of a wavefront, about. Fewer than there are pixels: parts of the film.
         """
-        n = (self.each if self.counts is None else self.counts) + more
+        n: Any = (self.each if self.counts is None else self.counts) + more
         largest = int(np.max(n))
         at_once = min(self.pixels, most)
         if at_once < self.pixels:
@@ -75,6 +75,8 @@ class Allotment:
                     yield self._even(first, some, start, high - low), done
                     continue
                 here = slice(first, first + some)
+                if not (high - low)[here].any():
+                    continue
                 start = index * self.counts[here] + before + low[here]
                 yield self._uneven(first, start, (high - low)[here], n[here], more), done
 

@@ -4,7 +4,7 @@ With f the footprint of a pixel at a gather point (world units, its width there,
 path), w the width of the kernel in pixels (``survey`` finds it pixel by pixel), and r_i the
 bandwidth of pass i (0-based, see ``schedule``), the kernel's radius is
 
-    r(p) = clip(w f r_i/r_0, l_i r_i, r_i),      l_i = 1/max(M, i + 1),
+    r(p) = clip(w f r_i/r_0, l_i r_i, r_i),      l_i = 1/max(4, M, i + 1),
 
 M the number of passes, 16 where it is open. So all passes together hold at least the photons of a
 kernel of r_0. Everything shrinks alike from pass to pass, so that the mean over passes converges as
@@ -13,7 +13,6 @@ with one radius; r_i and l_i are functions of i and the parameters alone.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +21,8 @@ import mitsuba as mi
 
 # Passes that are reckoned with where their number is open.
 OPEN = 16
+# Kernels may be narrower than the bandwidth by so much in any case.
+_LEAST = 4
 
 
 @dataclass  # not frozen: Dr.Jit traverses it
@@ -82,4 +83,4 @@ def of(sensor, radius: float, widths=1.0) -> Footprint:
 
 def least_share(index: int, passes: int) -> float:
     """Smallest share of the bandwidth of a pass that a kernel may have."""
-    return 1 / max(passes or OPEN, index + 1)
+    return 1 / max(passes or OPEN, index + 1, _LEAST)

@@ -79,7 +79,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int, count=None, radius=Non
         )
     found = survey.look(scene, sensor, radius, seed, each, maps, count, automatic)
     if not count:
-        count = int(min(max(_rounded(found.light_paths), FEWEST), MOST))
+        count = min(max(_rounded(found.light_paths), FEWEST), MOST)
         if automatic:
             radius = min(radius * math.sqrt(reference / count), LARGEST * scene.extent)
     return Settled(count, radius, found.share, found.counts, found.widths)
@@ -87,7 +87,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int, count=None, radius=Non
 
 def _rounded(number: float) -> int:
     """To two digits, so that machines whose arithmetic differs in the last ones agree."""
-    return round(number, 1 - int(math.log10(number))) if number >= 1 else 0
+    return int(round(number, 1 - int(math.log10(number)))) if number >= 1 else 0
 
 
 def _weighted_median(radii) -> float:

@@ -20,8 +20,8 @@ import numpy as np
 
 from . import advice, digest, footprint, memory, state
 from . import film as films
-from .allotment import Allotment
 from .accumulate import Sums, mean_and_variance, relative_standard_error
+from .allotment import Allotment
 from .clock import Clock
 from .errors import is_interrupt
 from .eye import Thinning
@@ -299,6 +299,7 @@ class _Run:
             self.unfinished = image, dict(counts)
             if done < 1:
                 self._report(index, done)
+        counts["spp"] = share
         return image, counts
 
     def _eye_pass(self, index, spp, colour, counts):

@@ -1,17 +1,17 @@
-"""What a few pairs of eye paths tell before the first pass: how many of them should gather, how many
-light paths they are worth, and which pixels need more of them than others.
+"""What pairs of eye paths tell before the first pass: how many of them should gather, how many
+light paths they are worth, how wide kernels should be, and which pixels need more samples.
 
 Two independent means a, b over k = 4 stratified samples of one pixel are read from two independent
 photon maps A, B. With the gathered light g and all the rest l, weighted by 1/(mean² + floor²) so
 that errors are relative,
 
-    V_r = k⟨(l_a − l_b)²⟩/2                     of an eye path, without what it gathers,
-    V_g = k⟨(g_aA − g_bA)(g_aB − g_bB)⟩/2       of a gather, were there no end of photons,
-    V_gp = k⟨(g_aA − g_bA)²⟩/2 − V_g            of a gather, by the photons that it alone meets,
-    V_p = ⟨(g_aA − g_aB)(g_bA − g_bB)⟩/2        of the photons that all samples of a pixel share.
+    V_r = k⟨(l_a − l_b)²⟩/2                    of an eye path, without what it gathers,
+    V_g = k⟨(g_aA − g_bA)(g_aB − g_bB)⟩/2      of a gather, were there no end of photons,
+    V_gp = k⟨(g_aA − g_bA)²⟩/2 − V_g           of a gather, by the photons that it alone meets,
+    V_p = ⟨(g_aA − g_aB)(g_bA − g_bB)⟩/2       of photons that a pixel's samples share.
 
-A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot) has
-the variance  A/n + B/N,  A = V_r + V_g/q,  B = N_0 (V_p + V_gp/(q n)),  and costs
+A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot)
+has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)), and costs
 n P (1 + q C_g) + N C_p, P the number of pixels. For given n, variance times cost is smallest at
 
     q² = (V_g + V_gp)/(V_r C_g),        N² = n² P (1 + q C_g) B / (A C_p),
@@ -53,7 +53,7 @@ _THINNEST, _WIDEST = 1.0, 8.0
 _LEAST_SHARE, _GATHERS_PER_PIXEL = 1 / 8, 2
 # Work of an eye path: of its first ray, of a vertex.
 _CAMERA, _VERTEX = 0.3, 0.4
-# Work in units of a typical eye path: a gather, each photon it meets, a light path, a photon it leaves.
+# Work of a gather, each photon it meets, a light path, a photon it leaves; an eye path is about 1.
 _GATHER, _MET, _LIGHT_PATH, _LEFT = 1.2, 1 / 40, 0.6, 0.4
 # Variance of an eye sample among many stratified ones, as a share of that among _SAMPLES.
 _STRATIFIED = 0.3
@@ -95,9 +95,10 @@ def look(
     lane = dr.arange(mi.UInt32, tiles.lanes)
     sampler.begin(stream_seed(seed, PILOT, 3), lane // _SAMPLES, lane % _SAMPLES)
     ray, _ = rays_through(sensor, sampler, tiles.positions(sensor, seed, sampler), 0.5)
-    if choose:  # as wide as they are told to be
+    if choose:  # kernels as wide as they are told to be
         radius = 0.1 * scene.extent
-        free = replace(footprint.of(sensor, radius), least=dr.opaque(mi.Float, 1e-6))
+    free = replace(footprint.of(sensor, radius), least=dr.opaque(mi.Float, 1e-6))
+    if choose:
         scene = replace(scene, footprint=free)
     vertices = dr.zeros(mi.Float, tiles.lanes)
 
@@ -118,8 +119,8 @@ def look(
     gathered = []
     for width in (_NARROW, _WIDE) if choose else (1.0,):
         if choose:
-            wide = replace(scene.footprint, widths=dr.opaque(mi.Float, width))
-            scene = replace(scene, footprint=wide)
+            free = replace(free, widths=dr.opaque(mi.Float, width))
+            scene = replace(scene, footprint=free)
         gathered.append(
             [_gathered(scene, map_, radius, seed, points, colours, tiles.lanes) for map_ in maps]
         )
@@ -257,7 +258,7 @@ class _Tiles:
         return pairs.reshape(self.down, self.across)
 
     def weight(self, light) -> np.ndarray:
-        """1/(mean² + floor²) of each pair, the floor a quarter of the median: errors are relative."""
+        """1/(mean² + floor²) of each pair, the floor a quarter of the median."""
         level = _smooth(self.grid(light.mean(1)))
         lit = level[level > 0]
         floor = 0.25 * float(np.median(lit)) if lit.size else 1.0

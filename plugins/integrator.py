@@ -81,9 +81,9 @@ class AnisoPhotonMapper:
 
      * - photon_count
        - |int|
-       - Light paths per pass. 0 chooses as many as are about as much work as the eye samples of a
-         pass, between 10,000 and 5 million; the choice is in ``statistics["photon_count"]``.
-         (Default: 250000)
+       - Light paths per pass. 0 chooses as many as a pilot finds worth their time beside the eye
+         samples of a pass, between 10,000 and 5 million; the choice is in
+         ``statistics["photon_count"]``. (Default: 0)
 
      * - passes
        - |int|
@@ -111,8 +111,9 @@ class AnisoPhotonMapper:
        - Kernel radius r of the first pass in world units: weight exp(-a²-b²) with half axes of
          :math:`|s \times t| = r^2`, cut at :math:`a^2+b^2=4`. 0 chooses the radius at which a
          kernel holds 60 photons, in the median over the light that the camera sees
-         (``statistics["initial_radius"]``); later passes make do with fewer: 1.75 times the
-         width of a pixel where the kernel is, between that radius and 1/(i+1) of it, or a fifth.
+         (``statistics["initial_radius"]``), and makes kernels narrower where the light that a pilot
+         finds is not smooth: 1 to 8 widths of a pixel where the kernel is, between that radius and
+         a quarter of it, or with more passes 1/passes (1/16 where their number is open).
          (Default: 0)
 
      * - alpha
@@ -165,9 +166,11 @@ class AnisoPhotonMapper:
     stratified sequence, so that their mean is better than their spread says: an upper estimate.
 
     Eye paths take their random numbers from an ``owen_sobol`` sequence that goes on from pass to
-    pass, whatever the sampler of the scene, which says only how many samples there are. Some of the
-    eye paths of a pixel read the photon map for all of them, as many as a pilot finds worth their
-    time (``statistics["share_of_gathers"]``).
+    pass, whatever the sampler of the scene, which says only how many samples there are. That number
+    is a mean: pixels in which a pilot finds more noise for the work get up to four times as many,
+    others as few as a quarter, with weights that make up for it. Some of the eye paths of a pixel
+    read the photon map for all of them, as many as the pilot finds worth their time
+    (``statistics["share_of_gathers"]``).
 
     Before ``render()`` these attributes may be set: ``progress``, a function (done, total, text)
     that is called after each wavefront (see ``aniso_pm.progress.bar``); ``callback``, a function

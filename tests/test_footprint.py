@@ -12,35 +12,50 @@ def camera(kind="perspective", **more):
     return mi.load_dict({"type": kind, "film": film} | more)
 
 
-def last(found):
-    """In a late pass."""
-    return footprint.in_pass(found, 1000)
+def late(found):
+    """In a late pass of many."""
+    return found.in_pass(10**6, 0)
+
+
+def shares(found, distances):
+    return found.share(mi.Float(distances), mi.UInt32(0)).numpy()
 
 
 def test_footprint_of_a_perspective_camera_is_the_pixels_angle_times_the_path(variant_llvm_rgb):
     sensor = camera(fov=40, fov_axis="x")
-    found = last(footprint.of(sensor, radius=0.5))
+    found = late(footprint.of(sensor, radius=0.5, widths=1.75))
     pixel = 2 * np.tan(np.radians(20)) / 100
-    wanted = np.clip(1.75 * pixel * np.array([1.0, 10, 20, 100]) / 0.5, 0.2, 1)
-    share = found.share(mi.Float([1, 10, 20, 100])).numpy()
-    np.testing.assert_allclose(share, wanted, rtol=1e-3)  # angle against tangent
+    wanted = np.clip(1.75 * pixel * np.array([1.0, 10, 20, 100]) / 0.5, 0, 1)
+    # angle against tangent; paths begin at the near plane, where a pixel is this wide
+    found = shares(found, [1, 10, 20, 100])
+    np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1.75 * 0.011 * pixel / 0.5)
 
 
 def test_footprint_of_an_orthographic_camera_is_its_pixels_width(variant_llvm_rgb):
     to_world = mi.ScalarTransform4f().scale([3, 3, 1])
-    found = last(footprint.of(camera("orthographic", to_world=to_world), radius=1))
+    sensor = camera("orthographic", to_world=to_world)
     # 6 world units by 100 pixels, as wide after any path
-    np.testing.assert_allclose(found.share(mi.Float([0, 1, 50])).numpy(), 0.2, rtol=1e-5)
-    found = last(footprint.of(camera("orthographic", to_world=to_world), radius=0.2))
-    np.testing.assert_allclose(found.share(mi.Float([0, 1, 50])).numpy(), 0.525, rtol=1e-3)
+    found = late(footprint.of(sensor, radius=0.2, widths=2.0))
+    np.testing.assert_allclose(shares(found, [0, 1, 50]), 0.6, rtol=1e-3)
 
 
-def test_all_passes_together_keep_the_photons_of_the_first(variant_llvm_rgb):
-    """Photons of a kernel grow with its area; the first pass has the whole bandwidth."""
-    found = footprint.of(camera(), 1.0)
-    for share, passes in ((1, 1), (0.5, 2), (0.2, 5), (0.2, 100)):
-        least = footprint.in_pass(found, passes - 1).share(mi.Float(0)).numpy()
-        np.testing.assert_allclose(least, share, rtol=1e-6)
+def test_every_pixel_has_its_own_width(variant_llvm_rgb):
+    to_world = mi.ScalarTransform4f().scale([3, 3, 1])
+    widths = np.linspace(1, 8, 8000)
+    found = late(footprint.of(camera("orthographic", to_world=to_world), 10.0, widths))
+    found = found.seen_by(mi.UInt32([7999, 17, 4000]))
+    share = found.share(mi.Float(1), mi.UInt32([1, 0, 2, 1])).numpy()
+    np.testing.assert_allclose(share, 0.006 * widths[[17, 7999, 4000, 17]], rtol=1e-3)
+
+
+def test_kernels_are_never_wider_than_the_bandwidth_nor_narrower_than_passes_allow(
+    variant_llvm_rgb,
+):
+    found = footprint.of(camera(), 1.0, 1e-3)
+    for least, index, passes in ((1 / 4, 0, 1), (1 / 8, 0, 8), (1 / 16, 3, 0), (1 / 100, 99, 0)):
+        np.testing.assert_allclose(shares(found.in_pass(index, passes), [0]), least, rtol=1e-6)
+    wide = footprint.of(camera(), 1e-6).in_pass(0, 0)
+    np.testing.assert_allclose(shares(wide, [100]), 1)
 
 
 def test_of_a_pixels_samples_the_same_number_gathers(variant_llvm_rgb):

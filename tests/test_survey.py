@@ -1,0 +1,83 @@
+"""What the survey finds, against what renderings of known noise show."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from aniso_pm import pilot, survey
+from aniso_pm.prepared import prepare
+from aniso_pm.settings import Settings
+from rooms import room, room_with_ball
+
+
+def settled(definition, each=16, **settings):
+    scene = mi.load_dict(definition)
+    prepared = prepare(scene, Settings(**settings), False)
+    return pilot.settle(prepared, scene.sensors()[0], 0, each), scene
+
+
+def test_a_scene_without_photons_needs_none_and_no_gathers(variant_llvm_rgb):
+    found, _ = settled(room(size=32))
+    assert found.share == 1 and found.widths.size == 1
+    assert found.count == pilot.FEWEST
+
+
+def test_what_is_given_is_kept(variant_llvm_rgb):
+    scene = mi.load_dict(room_with_ball(size=16))
+    prepared = prepare(scene, Settings(map="global"), False)
+    found = pilot.settle(prepared, scene.sensors()[0], 0, 16, count=12_345, radius=0.07)
+    assert (found.count, found.radius) == (12_345, 0.07)
+    assert (found.widths == 1).all()  # no widths beside a radius that was given
+
+
+def test_it_is_a_function_of_scene_and_seed(variant_llvm_rgb):
+    first, second = (settled(room_with_ball(size=24), map="global")[0] for _ in range(2))
+    assert first.count == second.count and first.share == second.share
+    np.testing.assert_allclose(first.widths, second.widths, rtol=1e-3)
+
+
+def test_more_samples_ask_for_more_light_paths(variant_llvm_rgb):
+    """As n where the widths of kernels are bounded, as n^1.25 where they shrink as N^(-1/5)."""
+    few, many = (settled(room_with_ball(size=24), each, map="global")[0] for each in (128, 512))
+    assert 3.5 < many.count / few.count < 6.5
+
+
+def test_kernels_are_wide_where_light_is_smooth_and_narrow_at_an_edge():
+    """The rule itself, with photons of equal noise everywhere and light that changes on the right
+    half only."""
+    tiles = survey._Tiles(2, 64, 48)
+    count = tiles.across * tiles.down
+    change = np.zeros((tiles.down, tiles.across))
+    change[:, 20:] = 0.04
+    widths = survey._widths(tiles, np.full(count, 2e5), change.ravel(), 16 * 1e5)
+    assert (widths[:, :14] == survey._WIDEST).all()
+    smooth, edge = widths[:, :14].mean(), widths[:, 25:]
+    assert edge.mean() < 0.6 * smooth
+    # bias² = 2/3 of the variance at the minimum, bias² + half a standard error being given
+    bias2 = (0.04 + tiles.uncertainty(change.ravel())[:, 28]) / (2**1.5 - 1) ** 2
+    w = widths[:, 28]
+    np.testing.assert_allclose(bias2 * (w / 4) ** 3, 2 / 3 * 2e5 / (16e5 * w**2), rtol=1e-6)
+
+
+@pytest.mark.parametrize("edge", [1, 3])
+def test_tiles_cover_every_pixel_once(edge):
+    tiles = survey._Tiles(edge, 10, 7)
+    numbers = np.arange(tiles.across * tiles.down).reshape(tiles.down, tiles.across)
+    pixels = tiles.to_pixels(numbers).reshape(7, 10)
+    for y in range(7):
+        for x in range(10):
+            assert pixels[y, x] == (y // edge) * tiles.across + x // edge
+
+
+def test_variances_are_those_of_the_samples(variant_llvm_rgb):
+    """V_r, V_g, V_gp and V_p of numbers that are made to have them."""
+    random = np.random.default_rng(1)
+    count, k = 200_000, survey._SAMPLES
+    gather = random.normal(0, np.sqrt(0.3 / k), (count, 2))  # of each mean, whatever the map
+    shared = random.normal(0, np.sqrt(0.2), (2, count, 1))  # of each map
+    alone = random.normal(0, np.sqrt(0.5 / k), (2, count, 2))
+    a, b = (gather + shared[m] + alone[m] for m in (0, 1))
+    weight = np.ones(count)
+    assert survey._within(a, b, weight).mean() == pytest.approx(0.3, rel=0.03)
+    v_shared, v_alone = survey._of_photons(a - b, weight)
+    assert v_shared.mean() == pytest.approx(0.2, rel=0.03)
+    assert v_alone.mean() == pytest.approx(0.5, rel=0.03)
