@@ -102,17 +102,17 @@ class Allotment:
         return Lanes(pixel + dr.opaque(mi.UInt32, first), sample, weight, dr.width(pixel))
 
 
-def in_proportion(noise: np.ndarray, each: int, random: np.ndarray) -> np.ndarray | None:
-    """Samples of each pixel in proportion to ``noise``, ``each`` in the mean; None where that is
-    too little to tell pixels apart.
-
-    random: in [0, 1), of each pixel: what rounds a number up.
-    """
-    if each < 2 or not noise.mean() > 0:
+def in_proportion(noise: np.ndarray, each: int) -> np.ndarray | None:
+    """Samples of each pixel in proportion to ``noise``, exactly ``each`` in the mean; None where
+    that is too little to tell pixels apart."""
+    if each * LEAST < 1 or not noise.mean() > 0:
         return None
     share = noise / noise.mean()
     for _ in range(8):  # bounds and mean together
         share = np.clip(share, LEAST, MOST)
         share /= share.mean()
-    counts = np.maximum(np.floor(share * each + random), 1).astype(np.int64)
+    # What rounding takes from a pixel its neighbour gets.
+    counts = np.diff(np.round(np.cumsum(share) * each), prepend=0).astype(np.int64)
+    counts = np.maximum(counts, 1)
+    counts[np.argmax(counts)] += each * counts.size - counts.sum()
     return None if (counts == each).all() else counts

@@ -76,7 +76,8 @@ def of(sensor, radius: float, widths=1.0) -> Footprint:
         beside, _ = sensor.sample_ray(time, mi.Float(0.5), centre + step, aperture)
         start = dr.maximum(start, dr.norm(beside.o - ray.o))
         spread = dr.maximum(spread, dr.norm(beside.d - ray.d))
-    found = Footprint(start / radius, spread / radius, mi.Float(1), mi.Float(widths))
+    unit = dr.rcp(dr.opaque(mi.Float, radius))
+    found = Footprint(start * unit, spread * unit, mi.Float(1), mi.Float(widths))
     dr.make_opaque(found.start, found.spread, found.least, found.widths)
     return found
 

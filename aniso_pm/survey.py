@@ -108,10 +108,9 @@ def look(
     L, _, points = scene.trace(sampler, ray, see=see)
     work = _VERTEX * _pairwise(vertices).mean(1) + _CAMERA
     rest = _pairwise(dr.mean(L) + dr.zeros(mi.Float, tiles.lanes))
-    random = np.random.default_rng(stream_seed(seed, PILOT, 5)).random(tiles.pixels)
     if points is None or not min(map_.stored for map_ in maps):
         noise = _within(rest, rest, tiles.weight(rest))
-        counts = in_proportion(tiles.spread(noise, work), each, random)
+        counts = in_proportion(tiles.spread(noise, work), each)
         return Survey(1.0, 0.0, counts, np.ones(1))
 
     # --- Gathered light of a wide and a narrow kernel, from either map ---
@@ -170,7 +169,7 @@ def look(
             eye = max(v_eye + v_gather / share, 1e-30)
             paths = max(each * tiles.pixels * math.sqrt(photons * costs / eye), 1.0)
     noise = v_rest + 0.5 * (_within(a, a, weight) + _within(b, b, weight)) / share
-    counts = in_proportion(tiles.spread(noise, work + share * gather), each, random)
+    counts = in_proportion(tiles.spread(noise, work + share * gather), each)
     return Survey(share, paths, counts, tiles.to_pixels(tiles.grid(widths)))
 
 

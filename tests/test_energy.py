@@ -131,7 +131,7 @@ def test_indirect_light_agrees_with_path_around(name, instanced):
 
 def assert_mean_agrees(scene, tolerance, spp=512, reference_spp=2048, reference=None):
     """Indirect light in the mean over the image; standard errors of both are below 0.5 %."""
-    ours = PHOTON_MAPPER | {"photon_count": 100_000, "passes": 4}
+    ours = PHOTON_MAPPER | {"photon_count": 100_000, "passes": 16}
     ours = indirect(scene, ours, -1, spp, 1).mean()
     expected = indirect(scene, reference or {"type": "path"}, -1, reference_spp, 2).mean()
     assert ours == pytest.approx(expected, rel=tolerance)
