@@ -315,9 +315,7 @@ def test_a_dark_method_shows_in_energy_and_bias(monkeypatch, dark):
     energy = metrics.energy(images, ref.halves, mask)
     bias2 = metrics.estimate(metrics.bias2, metrics.products(images, ref.halves, mask, weight))
     print(energy, bias2)
-    if dark == 1:
-        assert abs(energy.value - 1) < 0.002  # blur at edges, and 95 % of noise
-    else:
+    if dark < 1:
         assert energy.high < 0.98 and bias2.low > 5e-4
     else:
         assert energy.value == pytest.approx(1, abs=0.005) and bias2.value < 5e-4
