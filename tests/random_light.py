@@ -53,24 +53,26 @@ def rotation(rng):
 
 
 def scaling(rng, scale):
-    """Factors along x, y, z, of either sign: "rigid", "uniform", "round" (equal along x and y) or
-    "uneven"."""
+    """Factors along x, y, z: "rigid", "uniform", "round" (equal along x and y) or "uneven", of
+    either sign; "still": uniform without mirroring."""
     factors = np.exp(rng.uniform(-0.7, 0.7, 3))
     if scale == "round":
         factors[1] = factors[0]
-    if scale == "uniform":
+    if scale in ("uniform", "still"):
         factors[:] = factors[0]
     if scale == "rigid":
         factors[:] = 1
-    return T().scale((factors * rng.choice([-1, 1], 3)).tolist())
+    signs = [1, 1, 1] if scale == "still" else rng.choice([-1, 1], 3)
+    return T().scale((factors * signs).tolist())
 
 
 def placed(rng, scale, size=1.0):
     """A random to_world, 2 to 4 units off the origin. Uneven scales are between two rotations, so
     that shapes are sheared, too."""
     inner = rotation(rng) if scale == "uneven" else T()
+    outer = T() if scale == "still" else rotation(rng)
     place = direction(rng) * rng.uniform(2, 4)
-    return T().translate(place.tolist()) @ rotation(rng) @ scaling(rng, scale) @ inner.scale(size)
+    return T().translate(place.tolist()) @ outer @ scaling(rng, scale) @ inner.scale(size)
 
 
 def aimed(rng, scale="rigid"):
@@ -84,7 +86,9 @@ def aimed(rng, scale="rigid"):
 
 def texels(rng, height=4, width=4, channels=3):
     """Random ones, some of them ten times as bright as others."""
-    values = rng.uniform(0.1, 1, (height, width, channels)) * rng.choice([1, 10], (height, width, 1))
+    values = rng.uniform(0.1, 1, (height, width, channels)) * rng.choice(
+        [1, 10], (height, width, 1)
+    )
     return mi.Bitmap(values.astype(np.float32))
 
 
@@ -96,21 +100,31 @@ def texture(rng):
     return {"type": "bitmap", "bitmap": texels(rng), "filter_type": "nearest"}
 
 
-def area(shape, scale, textured):
+def area(shape, scale, textured, inside=False):
+    """A shape that emits, small and beside the receivers, or around them and inwards. Closed ones
+    beside them emit outwards: of what should stay inside, Mitsuba's shadow rays let 1 % out."""
+
     def make(rng):
         radiance = texture(rng) if textured else colour(rng)
         emitter = {"type": "area", "radiance": radiance}
-        flip = {"flip_normals": bool(rng.integers(2))}
-        return {"light": shape | flip | {"to_world": placed(rng, scale, 0.4), "emitter": emitter}}
+        to_world = placed(rng, scale, 4.0 if inside else 0.4)
+        if inside:
+            to_world = T().translate((-np.array(to_world.matrix)[:3, 3]).tolist()) @ to_world
+        flip = bool(rng.integers(2))
+        if shape in ("cube", "sphere"):
+            mirrored = np.linalg.det(np.array(to_world.matrix)[:3, :3]) < 0
+            flip = inside != (mirrored and shape == "sphere")  # whose sides mirroring exchanges
+        light = {"type": shape, "flip_normals": flip, "to_world": to_world, "emitter": emitter}
+        return {"light": light}
 
     return make
 
 
 def several(rng):
     """Four at once; how often ``path`` asks each must not change what arrives."""
-    lights = area({"type": "sphere"}, "uniform", False)(rng)
+    lights = area("sphere", "uniform", False)(rng)
     lights["light"]["emitter"]["sampling_weight"] = rng.uniform(0.5, 2)
-    lights["panel"] = area({"type": "rectangle"}, "uneven", True)(rng)["light"]
+    lights["panel"] = area("rectangle", "uneven", True)(rng)["light"]
     lights["bulb"] = {"type": "point", "intensity": colour(rng), "to_world": placed(rng, "uneven")}
     lights["spot"] = spot(False)(rng)["light"] | {"sampling_weight": rng.uniform(0.5, 2)}
     return lights
@@ -119,7 +133,7 @@ def several(rng):
 def outside(rng):
     """From near and far at once."""
     return {
-        "light": area({"type": "rectangle"}, "uneven", False)(rng)["light"],
+        "light": area("rectangle", "uneven", False)(rng)["light"],
         "sky": envmap(rng)["light"] | {"scale": 0.2},
         "sun": {"type": "directional", "to_world": aimed(rng), "irradiance": colour(rng)},
     }
@@ -127,7 +141,7 @@ def outside(rng):
 
 def spot(textured):
     def make(rng):
-        light = {"type": "spot", "intensity": colour(rng), "to_world": aimed(rng)}
+        light = {"type": "spot", "intensity": colour(rng), "to_world": aimed(rng, "uniform")}
         light["cutoff_angle"] = rng.uniform(15, 60)
         light["beam_width"] = light["cutoff_angle"] * rng.uniform(0.3, 0.95)
         return {"light": light | ({"texture": texture(rng)} if textured else {})}
@@ -171,17 +185,16 @@ class Kind:
 
 def kinds():
     """Name → Kind, every class of emitter that light paths can start at."""
-    shapes = {
-        "rectangle": ({"type": "rectangle"}, "uneven"),
-        "disk": ({"type": "disk"}, "uneven"),
-        "cube": ({"type": "cube"}, "uneven"),
-        "sphere": ({"type": "sphere"}, "uniform"),
-        "cylinder": ({"type": "cylinder"}, "round"),
-    }
+    shapes = {"rectangle": "uneven", "disk": "uneven", "cube": "uneven"}
     table = {}
-    for name, (shape, scale) in shapes.items():
-        table[f"area, {name}"] = Kind(area(shape, scale, False))
-        table[f"textured area, {name}"] = Kind(area(shape, scale, True))
+    for textured in (False, True):
+        # Textured spheres that are turned are refused.
+        scales = shapes | {"sphere": "still" if textured else "uniform", "cylinder": "round"}
+        for shape, scale in scales.items():
+            name = f"{'textured ' if textured else ''}area, {shape}"
+            table[name] = Kind(area(shape, scale, textured))
+            if shape in ("cube", "sphere"):
+                table[f"{name} around"] = Kind(area(shape, scale, textured, True), open=True)
     parallel = {"type": "directionalarea", "radiance": {"type": "rgb", "value": [2, 3, 4]}}
     return table | {
         "point": Kind(
@@ -201,7 +214,7 @@ def kinds():
                 "light": {
                     "type": "directional",
                     "irradiance": colour(rng),
-                    "to_world": aimed(rng, "uniform"),
+                    "to_world": aimed(rng),
                 }
             },
             open=True,
@@ -218,7 +231,9 @@ def kinds():
             },
             parallel=True,
         ),
-        "constant": Kind(lambda rng: {"light": {"type": "constant", "radiance": colour(rng)}}, True),
+        "constant": Kind(
+            lambda rng: {"light": {"type": "constant", "radiance": colour(rng)}}, True
+        ),
         "envmap": Kind(envmap, open=True),
         "sunsky": Kind(sunsky, open=True),
         "several": Kind(several),
@@ -274,9 +289,7 @@ class Sides:
 
     @staticmethod
     def random(rng, centre):
-        return Sides(
-            mi.Vector3f(direction(rng)), mi.Vector3f(direction(rng)), mi.Point3f(centre)
-        )
+        return Sides(mi.Vector3f(direction(rng)), mi.Vector3f(direction(rng)), mi.Point3f(centre))
 
     def __call__(self, is_shell, p, d):
         """Six quantities; d points to where light comes from."""
@@ -378,7 +391,8 @@ def difference(kind, scene, sides, count, seed, wavelengths):
     apart = found[:, 0] - expected[:, 0]
     # Single precision: a constant light's total scatters by its rounding alone.
     error = np.hypot(error, 1e-4 * expected[:, 0])
-    return np.where(error > 0, apart / np.maximum(error, 1e-30), 0), found[:, 0] / expected[:, 0]
+    ratio = found[:, 0] / np.maximum(expected[:, 0], 1e-30)
+    return np.where(error > 0, apart / np.maximum(error, 1e-30), 0), ratio
 
 
 @dataclass(frozen=True)
