@@ -72,11 +72,12 @@ def amends(scene) -> Amends | None:
             emitter.set_scene(scene)
         if shape is None:
             continue
-        if shape.class_name() == "Sphere":
-            if is_turned(shape):
-                box = shape.bbox()
-                turns[k], centre[k] = _turn(shape), np.array(box.center())
-                radius[k] = 0.5 * box.extents()[0]
+        # (Textured ones look their points and normals up by texture coordinates.)
+        textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+        if shape.class_name() == "Sphere" and not textured:
+            turns[k], box = _turn(shape), shape.bbox()
+            if np.abs(turns[k] - np.eye(3)).max() > _WRONG:
+                centre[k], radius[k] = np.array(box.center()), 0.5 * box.extents()[0]
         if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection):
             factor[k] = _area_now_over_then(emitter, shape)
     if not radius.any() and np.abs(factor - 1).max(initial=0) < _WRONG:
@@ -87,11 +88,6 @@ def amends(scene) -> Amends | None:
     found = Amends(*columns, vector(centre), number(radius), number(factor))
     dr.make_opaque(found.x, found.y, found.z, found.centre, found.radius, found.factor)
     return found
-
-
-def is_turned(sphere) -> bool:
-    """Are the normals of samples of a sphere wrong?"""
-    return bool(np.abs(_turn(sphere) - np.eye(3)).max() > _WRONG)
 
 
 def _turn(sphere) -> np.ndarray:

@@ -7,10 +7,10 @@ in one sentence that says what to do instead.
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .amends import is_turned
 from .ndf import children
 
 _ROUNDING = 1e-3
@@ -39,13 +39,20 @@ def refuse(scene):
                 "unevenly, under which Mitsuba's light paths and its emitter sampling disagree; "
                 "leave only rotations, mirrorings and one scale for all axes"
             )
-        shape = emitter.get_shape()
         varies = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-        if varies and shape is not None and shape.class_name() == "Sphere" and is_turned(shape):
+        shape = emitter.get_shape()
+        if varies and shape is not None and _strays(shape):
             raise ValueError(
-                f'aniso_pm: emitter "{emitter.id()}" has a texture on a sphere with a "to_world" '
-                "that turns or mirrors it, where Mitsuba's own sampling looks at other points of "
-                "the texture than its rays do; leave only scale and translation, or use a mesh"
+                f'aniso_pm: emitter "{emitter.id()}" has a texture on the shape "{shape.id()}", '
+                "where Mitsuba's emitter sampling finds other points, or the other side, than rays "
+                "meet; give the shape texture coordinates that do not overlap, and neither "
+                '"flip_normals" nor, on a sphere or cylinder, a "to_world" that turns or mirrors'
+            )
+        if shape is not None and shape.class_name() == "Cylinder" and _lies(shape)[1]:
+            raise ValueError(
+                f'aniso_pm: emitter "{emitter.id()}" is on a cylinder with a "to_world" that '
+                "mirrors it, where Mitsuba's emitter sampling finds the other side than rays meet; "
+                'leave the mirroring out (scale by -1), and give "flip_normals" the other value'
             )
 
 
@@ -65,3 +72,24 @@ def _scales(emitter) -> np.ndarray:
         return np.ones(3)
     matrix = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4, -1)[:3, :3, 0]
     return np.linalg.svd(matrix, compute_uv=False)
+
+
+def _strays(shape) -> bool:
+    """Does Mitsuba find other points of a shape by texture coordinates than have them? Of textured
+    emitters it draws texture coordinates."""
+    if isinstance(shape, mi.Mesh) and not shape.has_vertex_texcoords():
+        return True
+    near, other_side = _lies(shape)
+    return near < 0.97 or other_side  # edges and poles
+
+
+def _lies(shape) -> tuple[float, bool]:
+    """Of points of a shape that are looked up by texture coordinates: how many lie where they
+    should, and do normals there point to the other side?"""
+    u = mi.Point2f(np.random.default_rng(0).uniform(0, 1, (2, 256)).astype(np.float32))
+    sample = shape.sample_position(mi.Float(0), u)
+    found = shape.eval_parameterization(sample.uv)
+    size = dr.norm(mi.Vector3f(shape.bbox().extents()))
+    near = found.is_valid() & (dr.norm(found.p - sample.p) < 0.01 * size)
+    cosine = dr.select(near, dr.dot(found.n, sample.n), 0)
+    return float(dr.mean(dr.select(near, 1.0, 0.0))[0]), bool(dr.sum(cosine)[0] < 0)
