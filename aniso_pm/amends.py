@@ -83,9 +83,9 @@ def amends(scene) -> Amends | None:
     if not radius.any() and np.abs(factor - 1).max(initial=0) < _WRONG:
         return None
     vector = lambda rows: mi.Vector3f(rows.T.astype(np.float32))  # noqa: E731
-    columns = [vector(turns[:, :, k]) for k in range(3)]
+    x, y, z = (vector(turns[:, :, k]) for k in range(3))
     number = lambda values: mi.Float(values.astype(np.float32))  # noqa: E731
-    found = Amends(*columns, vector(centre), number(radius), number(factor))
+    found = Amends(x, y, z, vector(centre), number(radius), number(factor))
     dr.make_opaque(found.x, found.y, found.z, found.centre, found.radius, found.factor)
     return found
 
