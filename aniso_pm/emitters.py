@@ -30,6 +30,13 @@ def refuse(scene):
                 f'aniso_pm: emitter "{emitter.id()}" is a projector, whose light cannot be '
                 "evaluated at given wavelengths; use an RGB variant"
             )
+        if mi.is_spectral and kind == "SpotLight":
+            texture = children(emitter).get("texture")
+            if texture is not None and texture.class_name() != "UniformSpectrum":
+                raise ValueError(
+                    f'aniso_pm: emitter "{emitter.id()}" is a spot with a "texture", whose light '
+                    "cannot be evaluated at given wavelengths; use an RGB variant"
+                )
         lengths = _scales(emitter)
         if kind in ("Projector", "DirectionalEmitter") and np.abs(lengths - 1).max() > _ROUNDING:
             refuse_scale(emitter)

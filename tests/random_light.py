@@ -194,7 +194,16 @@ class Kind:
 
 
 def kinds():
-    """Name → Kind, every class of emitter that light paths can start at."""
+    """Name → Kind, every class of emitter that light paths can start at in this variant."""
+    table = _kinds()
+    if mi.is_spectral:
+        del table["projector"], table["textured spot"]
+    if mi.is_monochromatic:
+        del table["sunsky"]  # Mitsuba has none
+    return table
+
+
+def _kinds():
     shapes = {"rectangle": "uneven", "disk": "uneven", "obj": "uneven", "cube": "uneven"}
     table = {}
     for textured in (False, True):
@@ -211,7 +220,7 @@ def kinds():
                 table[f"{name} around"] = Kind(
                     area(shape, scale, textured, True), open=True, met=True
                 )
-    parallel = {"type": "directionalarea", "radiance": {"type": "rgb", "value": [2, 3, 4]}}
+    parallel = {"type": "directionalarea", "radiance": {"type": "uniform", "value": 3.0}}
     return table | {
         "point": Kind(
             lambda rng: {
@@ -417,8 +426,7 @@ def from_surface(scene, sides, count, seed, wavelengths):
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.p, si.n = point.p, point.n
     hit = scene.ray_intersect(si.spawn_ray(mi.Vector3f(point.n)))
-    radiance = mi.Color3f(2, 3, 4)
-    power = sum(radiance[k] * COLOURS[k] for k in range(3)) / point.pdf
+    power = weighed(mi.Spectrum(3)) / point.pdf
     lands, is_shell = mi.Bool(False), mi.Bool(False)
     for shape in receivers(scene):
         here = hit.is_valid() & (hit.shape == mi.ShapePtr(shape))

@@ -47,11 +47,18 @@ def test_light_paths_carry_what_arrives_in_500_tries(variant_llvm_rgb):
 
 
 @pytest.mark.slow
-def test_light_paths_carry_what_arrives_in_every_variant(variants_all):
-    names = list(random_light.kinds())
-    if mi.is_spectral:
-        names.remove("projector")  # refused
-    assert_nothing_is_found(names, 4, 1000, 1 << 16)
+@pytest.mark.parametrize("name", ["mono", "spectral"])
+def test_light_paths_carry_what_arrives_in_other_variants(request, name):
+    request.getfixturevalue(f"variant_llvm_{name}")
+    assert_nothing_is_found(list(random_light.kinds()), 2, 1000, 1 << 16)
+
+
+def test_textured_spots_are_refused_in_spectral_variants(variant_llvm_spectral):
+    light = {"type": "spot", "texture": texture(RNG)}
+    scene = mi.load_dict({"type": "scene", "light": light})
+    with pytest.raises(ValueError, match='spot with a "texture"'):
+        emission.prepare(scene)
+    emission.prepare(mi.load_dict({"type": "scene", "light": {"type": "spot"}}))
 
 
 def textured(shape, **more):
