@@ -33,6 +33,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .amends import Amends, amends
+from .emitters import refuse, refuse_scale
 from .ndf import children
 
 _FLOOR = 0.05
@@ -102,6 +104,7 @@ class Emission:
 
     textured     in spectral variants: do any emitting surfaces have textures?
     environment  Environment, or None where nothing surrounds the scene.
+    amends       what the emitters' own rays need to be right, or None.
     """
 
     scene: Any
@@ -109,6 +112,7 @@ class Emission:
     choose: mi.DiscreteDistribution | None
     textured: bool
     environment: Environment | None
+    amends: Amends | None = None
 
     def sample_ray(self, time, u1, u2, u3, active=True, wavelengths=None):
         """(ray, flux, emitter) of light paths; see ``mi.Scene.sample_emitter_ray``.
@@ -116,28 +120,32 @@ class Emission:
         wavelengths  nm, spectral variants: the ray has these, and the flux is W/nm at them.
         """
         if self.choose is None:
-            emitter, chance = dr.gather(mi.EmitterPtr, self.emitters, mi.UInt32(0), active), 1
+            index, chance = mi.UInt32(0), 1
         else:
             index, u1, chance = self.choose.sample_reuse_pmf(u1, active)
-            emitter = dr.gather(mi.EmitterPtr, self.emitters, index, active)
-        ray, flux = self._leave(emitter, time, u1, u2, u3, active, wavelengths)
+        emitter = dr.gather(mi.EmitterPtr, self.emitters, index, active)
+        ray, flux = self._leave(index, emitter, time, u1, u2, u3, active, wavelengths)
         return ray, flux / chance, emitter
 
-    def _leave(self, emitter, time, u1, u2, u3, active, wavelengths):
-        """(ray, flux) from given emitters. What surrounds the scene goes a way of its own; scenes
-        without the one or the other do not trace it."""
+    def _leave(self, index, emitter, time, u1, u2, u3, active, wavelengths):
+        """(ray, flux) from given emitters, ``index`` among all. What surrounds the scene goes a way
+        of its own; scenes without the one or the other do not trace it."""
         if self.environment is None:
-            return self._from_surfaces(emitter, time, u1, u2, u3, active, wavelengths)
+            return self._from_surfaces(index, emitter, time, u1, u2, u3, active, wavelengths)
         if self.choose is None:
             return self.environment.sample_ray(time, u1, u2, u3, active, wavelengths)
         around = emitter.is_environment()
-        near, flux = self._from_surfaces(emitter, time, u1, u2, u3, active & ~around, wavelengths)
+        near, flux = self._from_surfaces(
+            index, emitter, time, u1, u2, u3, active & ~around, wavelengths
+        )
         far, flux_far = self.environment.sample_ray(time, u1, u2, u3, active & around, wavelengths)
         return dr.select(around, far, near), dr.select(around, flux_far, flux)
 
-    def _from_surfaces(self, emitter, time, u1, u2, u3, active, wavelengths):
+    def _from_surfaces(self, index, emitter, time, u1, u2, u3, active, wavelengths):
         """(ray, flux) from emitters inside the scene, or infinitely far in one direction."""
         ray, flux = emitter.sample_ray(time, u1, u2, u3, active)
+        if self.amends is not None:
+            ray, flux = self.amends(index, ray, flux, active)
         if wavelengths is not None:
             flux = self._at(wavelengths, emitter, ray, u1, flux, active)
             ray.wavelengths = wavelengths
@@ -182,43 +190,28 @@ def prepare(scene) -> Emission:
 
     Raises ValueError for an emitter that cannot start light paths.
     """
-    for emitter in scene.emitters():
-        kind = emitter.class_name()
-        if kind == "TimedSunskyEmitter":
-            raise ValueError(
-                f'aniso_pm: emitter "{emitter.id()}" is a timed_sunsky, from which Mitsuba cannot '
-                'trace light (its sample_ray raises); use "sunsky" for one point in time'
-            )
-        if mi.is_spectral and kind == "Projector":
-            raise ValueError(
-                f'aniso_pm: emitter "{emitter.id()}" is a projector, whose light cannot be '
-                "evaluated at given wavelengths; use an RGB variant"
-            )
+    refuse(scene)
     environment = None
     if scene.environment() is not None:
         environment = Environment.of(scene)
         if environment.scaling() > 1e-3:
-            raise ValueError(
-                f'aniso_pm: emitter "{scene.environment().id()}" has a "to_world" that scales, '
-                "under which Mitsuba's own sampling gives directions that are not of unit length; "
-                "leave only rotations (about axes of length 1) and mirrorings (scale by -1)"
-            )
+            refuse_scale(scene.environment())
+    found = amends(scene)
     emitters = scene.emitters_dr()
     count = dr.width(emitters)
     varying = int(mi.EmitterFlags.Surface) | int(mi.EmitterFlags.SpatiallyVarying)
     textured = any((e.flags() & varying) == varying for e in scene.emitters())
     if count == 1:
-        return Emission(scene, emitters, None, textured, environment)
+        return Emission(scene, emitters, None, textured, environment, found)
     weight = np.array([e.sampling_weight() for e in scene.emitters()])
     delta = np.array([mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in scene.emitters()])
     seen = ~delta | (weight > 0)
-    even = Emission(
-        scene, emitters, mi.DiscreteDistribution(dr.ones(mi.Float, count)), textured, environment
-    )
-    lane = dr.arange(mi.UInt32, count * _PILOT_RAYS)
-    emitter = dr.gather(mi.EmitterPtr, emitters, lane // _PILOT_RAYS)
+    alike = mi.DiscreteDistribution(dr.ones(mi.Float, count))
+    even = Emission(scene, emitters, alike, textured, environment, found)
+    index = dr.arange(mi.UInt32, count * _PILOT_RAYS) // _PILOT_RAYS
+    emitter = dr.gather(mi.EmitterPtr, emitters, index)
     u1, u2, u3 = _random(count * _PILOT_RAYS)
-    _, flux = even._leave(emitter, mi.Float(0), u1, u2, u3, True, None)
+    _, flux = even._leave(index, emitter, mi.Float(0), u1, u2, u3, True, None)
     flux = dr.mean(flux)
     flux = dr.select(dr.isfinite(flux), flux, 0)
     power = dr.block_sum(flux, _PILOT_RAYS).numpy().astype(np.float64) * weight
