@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import density
-from .film import rays_through, wavelengths
+from .film import one_each, rays_through, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 
 # Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
@@ -39,7 +39,7 @@ def camera_rays(sensor, seed: int):
     ray, _ = sensor.sample_ray(
         mi.Float(sensor.shutter_open()), mi.Float(0.5), sampler.next_2d(), aperture
     )
-    return ray
+    return one_each(ray, _RAYS)
 
 
 def settle(scene: Prepared, sensor, seed: int, samples: int, count=None, radius=None):
