@@ -44,7 +44,16 @@ def rays_through(sensor, sampler, position, wavelength):
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     u = dr.opaque(mi.Float, wavelength)
-    return sensor.sample_ray(time, u, normalised, aperture)
+    ray, weight = sensor.sample_ray(time, u, normalised, aperture)
+    return one_each(ray, dr.width(position)), weight
+
+
+def one_each(ray, count: int):
+    """As many rays: some sensors (``radiancemeter``, ``distant``) give one for all samples, but
+    each sample goes a way of its own."""
+    if dr.width(ray) == count:
+        return ray
+    return dr.gather(type(ray), ray, dr.zeros(mi.UInt32, count))
 
 
 def wavelengths(sensor, u):

@@ -326,6 +326,9 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         bsdf = si.bsdf()
+        # Mirrored rectangles and cubes, and meshes wound against their vertex normals, have it on
+        # the other side than the shading normal, which is what BSDFs know.
+        si.n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
         wi_n, wi_s = dr.abs(dr.dot(ray.d, si.n)), dr.abs(mi.Frame3f.cos_theta(si.wi))
         # Where shading and geometric normal disagree about the side nothing is stored (no leaks).
         same_side = (dr.dot(-ray.d, si.n) * mi.Frame3f.cos_theta(si.wi)) > 0

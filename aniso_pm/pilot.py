@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import density, photons, survey
-from .film import wavelengths
+from .film import one_each, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 
 # Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
@@ -39,7 +39,7 @@ def camera_rays(sensor, seed: int):
     ray, _ = sensor.sample_ray(
         mi.Float(sensor.shutter_open()), mi.Float(0.5), sampler.next_2d(), aperture
     )
-    return ray
+    return one_each(ray, _RAYS)
 
 
 @dataclass(frozen=True)

@@ -261,7 +261,7 @@ def furnace(edge_compensation, albedo=0.5, radius=0.2):
 
 
 def test_a_furnace_is_uniform_up_to_its_edges():
-    image = np.array(mi.render(furnace(True), spp=64))
+    image = np.array(mi.render(furnace(True), spp=256))
     assert image.mean() == pytest.approx(2, rel=0.01)
     # The camera looks into a corner: without compensation its pixels lose up to 3/4 of the
     # indirect half. What is left is the noise of some 100 photons a kernel, the same in all
