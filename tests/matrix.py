@@ -128,6 +128,7 @@ def lights():
     rectangle = T().translate([0, 0.98, -0.1]).rotate([1, 0, 0], 90).scale(0.4)
     ceiling = {"type": "rectangle", "to_world": rectangle, "bsdf": black}
     textured = {"type": "area", "radiance": image((4, 4, 3), 7, True, 0, 16)}
+    turn = T().rotate([1, 0, 0], -60).scale([-1, 1, 1])
     point = {"type": "point", "position": [0.3, 0.6, 0.3], "intensity": rgb(2, 2, 2.5)}
     return {
         "area": ({"light": ceiling | {"emitter": area}}, False),
@@ -175,6 +176,31 @@ def lights():
         "envmap": (
             {"light": {"type": "envmap", "bitmap": mi.Bitmap(sky), "scale": 1.0}},
             True,
+        ),
+        "turned envmap": (
+            {"light": {"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": turn}},
+            True,
+        ),
+        "turned sunsky": (
+            {
+                "light": {
+                    "type": "sunsky",
+                    "sun_direction": [0.2, 0.4, 1],
+                    "sun_scale": 0.2,
+                    "to_world": turn,
+                }
+            },
+            True,
+        ),
+        "turned sphere": (
+            {
+                "light": {
+                    "type": "sphere",
+                    "to_world": T().translate([0.4, 0.5, 0]).rotate([1, 0, 0], 160).scale(0.2),
+                    "emitter": area,
+                }
+            },
+            False,
         ),
         "sunsky": (
             {"light": {"type": "sunsky", "sun_direction": [0.2, 1, 0.4], "sun_scale": 0.2}},
@@ -244,6 +270,23 @@ def rows():
         "envmap, diffuse": Row("envmap", block(diffuse)),
         "sunsky, diffuse": Row("sunsky", block(diffuse)),
         "several lights, diffuse": Row("several", block(diffuse)),
+        "turned envmap, diffuse": Row("turned envmap", block(diffuse)),
+        "turned sunsky, diffuse": Row("turned sunsky", block(diffuse)),
+        "turned sphere light, diffuse": Row("turned sphere", block(diffuse)),
+        "mirrored block and plate": Row(
+            objects={
+                "block": {
+                    "type": "cube",
+                    "to_world": T().translate([0.4, -0.6, 0.2]).scale([-0.3, 0.38, 0.3]),
+                    "bsdf": diffuse,
+                },
+                "plate": {
+                    "type": "rectangle",
+                    "to_world": T().translate([-0.3, -0.3, -0.4]).scale([0.5, 0.5, -1]),
+                    "bsdf": {"type": "twosided", "b": diffuse},
+                },
+            }
+        ),
         # --- every material ---
         "conductor": Row(objects=ball(mirror)),
         "roughconductor 0.1": Row(objects=ball(rough | {"alpha": 0.1})),

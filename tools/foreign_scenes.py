@@ -1,4 +1,4 @@
-"""Scenes that nobody here wrote: ``python tools/foreign_scenes.py FOLDER``.
+"""Scenes that nobody here wrote: ``python tools/foreign_scenes.py FOLDER_OR_FILE ...``.
 
 Every scene file of a folder (XML files with a sensor; not what others include) is rendered small,
 with ``path`` and with this integrator: as installed, and for every use of the map. Prints a
@@ -113,7 +113,7 @@ def measure(file, options):
     if options.pictures:
         options.pictures.mkdir(parents=True, exist_ok=True)
         both = np.concatenate([np.mean(halves, axis=0), ours], axis=1).astype(np.float32)
-        mi.util.write_bitmap(str(options.pictures / f"{file.stem}.png"), both)
+        mi.util.write_bitmap(str(options.pictures / f"{file.parent.name}_{file.stem}.png"), both)
     return row
 
 
@@ -134,12 +134,14 @@ def equal_seconds(scene, halves, seconds):
 
 
 def scene_files(folder, pattern):
-    """XML files with a sensor, of their own or included."""
-    files = sorted(folder.rglob(pattern)) if folder.is_dir() else [folder]
-    for file in files:
+    """(folder, XML file) of files with a sensor, of their own or included."""
+    if folder.is_file():
+        yield folder.parent.parent, folder
+        return
+    for file in sorted(folder.rglob(pattern)):
         text = file.read_text(errors="replace")
         if "<scene" in text and re.search("<sensor|<include", text) and "include" not in file.parts:
-            yield file
+            yield folder, file
 
 
 def run(file, arguments):
@@ -179,7 +181,7 @@ def line(name, row):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("paths", type=Path, nargs="*", metavar="FOLDER_OR_FILE")
     parser.add_argument("--pattern", default="*.xml", help="scene files, e.g. 'bsdf_*.xml'")
     parser.add_argument("--search", type=Path, action="append", default=[])
     parser.add_argument("--variant", default="llvm_ad_rgb")
@@ -194,13 +196,16 @@ def main():
         mi.set_variant(options.variant)
         print(json.dumps(measure(options.one, options)))
         return
-    if not options.folder:
+    if not options.paths:
         parser.error("which folder?")
     print("| scene | " + " | ".join(USES) + " | path/ours | remarks |")
     print("|---" * (len(USES) + 3) + "|")
-    for file in scene_files(options.folder, options.pattern):
-        row = run(file, [a for a in sys.argv[1:] if a != str(options.folder)])
-        print(line(file.relative_to(options.folder).with_suffix(""), row), flush=True)
+    arguments = [a for a in sys.argv[1:] if a not in map(str, options.paths)]
+    for folder, file in (
+        pair for path in options.paths for pair in scene_files(path, options.pattern)
+    ):
+        row = run(file, arguments)
+        print(line(file.relative_to(folder).with_suffix(""), row), flush=True)
 
 
 if __name__ == "__main__":
