@@ -46,7 +46,9 @@ def load(file, search, longest):
     resolver = mi.file_resolver()
     for folder in reversed([file.parent, *search]):
         resolver.prepend(str(folder))
-    scene = mi.load_file(str(file))
+    text = file.read_text()
+    wanted = set(re.findall(r"\$(\w+)", text)) - set(re.findall(r'default name="(\w+)"', text))
+    scene = mi.load_file(str(file), **dict.fromkeys(wanted & {"spp"}, "16"))  # not used here
     sensor = scene.sensors()[0]
     parameters = mi.traverse(sensor)
     size = np.array(parameters["film.size"]).ravel()
@@ -63,23 +65,23 @@ def picture(scene, plugin, spp, seed):
     return image[..., :3]
 
 
-def rate(scene, plugin, seed):
-    """Samples a pixel and second, kernels compiled."""
+def samples_for(scene, plugin, seconds, seed):
+    """Samples a pixel that take so long, kernels compiled and what a render costs once included."""
     spp = 4
     picture(scene, plugin, spp, seed)
     while True:
         start = time.perf_counter()
-        picture(scene, plugin, spp, seed + spp)
-        seconds = time.perf_counter() - start
-        if seconds > 0.2 or spp >= 1 << 14:
-            return spp / seconds
-        spp *= 4
+        picture(scene, plugin, spp, seed)
+        took = time.perf_counter() - start
+        if took > 0.4 * seconds:
+            return max(4, int(spp * seconds / took))
+        spp = int(spp * np.clip(0.7 * seconds / took, 2, 16))
 
 
 def renders(scene, parameters, seconds, seed):
     """ROUNDS independent pictures that take so long together."""
     plugin = mi.load_dict(parameters)
-    spp = max(4, int(rate(scene, plugin, seed) * seconds / ROUNDS))
+    spp = samples_for(scene, plugin, seconds / ROUNDS, seed)
     return [picture(scene, plugin, spp, seed + 1 + k) for k in range(ROUNDS)]
 
 
@@ -122,10 +124,10 @@ def equal_seconds(scene, halves, seconds):
     errors = []
     for parameters in ({"type": "path"}, {"type": "aniso_pm"}):
         plugin = mi.load_dict(parameters)
-        spp = max(4, int(rate(scene, plugin, 5000) * seconds))
+        spp = samples_for(scene, plugin, seconds, 5000)
         start = time.perf_counter()
         image = picture(scene, plugin, spp, 5001)
-        # Rates change with the number of samples; errors go as one over the time.
+        # What it took after all; errors go as one over the time.
         errors.append(error(image, halves) * (time.perf_counter() - start) / seconds)
     return errors[0] / errors[1] if min(errors) > 0 else None
 
