@@ -4,11 +4,11 @@ With f the footprint of a pixel at a gather point (world units, its width there,
 path), w the width of the kernel in pixels (``survey`` finds it pixel by pixel), and r_i the
 bandwidth of pass i (0-based, see ``schedule``), the kernel's radius is
 
-    r(p) = clip(w f r_i/r_0, l_i r_i, r_i),      l_i = 1/max(4, M, i + 1),
+    r(p) = clip(w f r_i/r_0, l_i r_i, r_i),      l_i = 1/max(4, i + 1).
 
-M the number of passes, 16 where it is open. So all passes together hold at least the photons of a
-kernel of r_0. Everything shrinks alike from pass to pass, so that the mean over passes converges as
-with one radius; r_i and l_i are functions of i and the parameters alone.
+Everything shrinks from pass to pass, so that the mean over passes converges as with one radius; r_i
+and l_i are functions of i alone, however many passes there will be: passes that were rendered apart
+add up.
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-# Passes that are reckoned with where their number is open.
-OPEN = 16
-# Kernels may be narrower than the bandwidth by so much in any case.
+# Kernels of the first passes may be narrower than the bandwidth by so much.
 _LEAST = 4
 
 
@@ -50,9 +48,9 @@ class Footprint:
             width = dr.gather(mi.Float, width, dr.gather(mi.UInt32, self.pixel, lane))
         return dr.clip(width * dr.fma(self.spread, distance, self.start), self.least, 1)
 
-    def in_pass(self, index: int, passes: int) -> Footprint:
-        """The same in pass ``index`` (0-based) of ``passes``, 0 if their number is open."""
-        return replace(self, least=dr.opaque(mi.Float, least_share(index, passes)))
+    def in_pass(self, index: int) -> Footprint:
+        """The same in pass ``index`` (0-based)."""
+        return replace(self, least=dr.opaque(mi.Float, least_share(index)))
 
     def seen_by(self, pixel) -> Footprint:
         """The same for eye paths of these pixels (UInt32)."""
@@ -82,6 +80,6 @@ def of(sensor, radius: float, widths=1.0) -> Footprint:
     return found
 
 
-def least_share(index: int, passes: int) -> float:
-    """Smallest share of the bandwidth of a pass that a kernel may have."""
-    return 1 / max(passes or OPEN, index + 1, _LEAST)
+def least_share(index: int) -> float:
+    """Smallest share of the bandwidth of pass ``index`` (0-based) that a kernel may have."""
+    return 1 / max(_LEAST, index + 1)

@@ -151,11 +151,12 @@ class _Run:
         settings, checkpoint = self.scene.settings, self.controls.checkpoint
         earlier = checkpoint.start() if checkpoint else None
         known = earlier.identity if earlier else {}
-        count = settings.photon_count or known.get("photon count")
-        self.radius0 = settings.initial_radius or known.get("initial radius")
         each = self.shares.each
-        found = settle(self.scene, self.sensor, self.seed, each, count, self.radius0)
-        count, self.radius0 = found.count, found.radius
+        # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
+        given = settings.photon_count or None, settings.initial_radius or None
+        found = settle(self.scene, self.sensor, self.seed, each, *given)
+        count = known.get("photon count") or found.count
+        self.radius0 = known.get("initial radius") or found.radius
         self.share = known.get("share of gathers") or found.share
         self.allotment = Allotment(films.pixel_count(self.film), each, found.counts)
         self.scene = self.scene.with_(photon_count=count)
@@ -311,7 +312,7 @@ class _Run:
         most = min(max(pixels, WAVEFRONT // scene.crowding), self.plan.eye_samples)
         # An array, not a number: as a literal it would make every pass compile kernels of its own.
         radius = dr.opaque(mi.Float, self.radius)
-        pixel = scene.footprint and scene.footprint.in_pass(index, scene.settings.passes)
+        pixel = scene.footprint and scene.footprint.in_pass(index)
         sampler = mi.load_dict({"type": "owen_sobol"})
         each, before = self.allotment.each, self.shares.before(index) - index * self.allotment.each
         image = None

@@ -26,7 +26,7 @@ is smooth and as √w in the mean around an edge; between them, as w^1.5,
 
     bias²(w) = ⟨D D'⟩ (w/4)³/(2^1.5 − 1)²,    so    w⁵ = 2 B₁/(3 M N) · 4³ (2^1.5 − 1)²/⟨D D'⟩
 
-makes bias² + B₁/(w² M N) smallest, M the number of passes. Means are taken over tiles and their
+makes bias² + B₁/(w² M N) smallest after M = 8 passes. Means are taken over tiles and their
 neighbours.
 """
 
@@ -49,6 +49,8 @@ _TILES, _SAMPLES = 4096, 4
 # Widths of kernels that are compared, and the range of those that are chosen, in pixels.
 _NARROW, _WIDE = 4.0, 8.0
 _THINNEST, _WIDEST = 1.0, 8.0
+# Passes that the widths are right for, however many there will be: passes add up.
+_PASSES = 8
 # Smallest share of eye paths that gather, and smallest number of them in a pixel and pass.
 _LEAST_SHARE, _GATHERS_PER_PIXEL = 1 / 8, 2
 # Work of an eye path: of its first ray, of a vertex.
@@ -139,7 +141,6 @@ def look(
 
     # --- Decisions ---
     share, paths = 1.0, light_paths or 5 * emitted
-    passes = scene.settings.passes or footprint.OPEN
     narrow, wide = (_NARROW, _WIDE) if choose else (1.0, 1.0)
     widths = np.full(len(rest), narrow)
     for _ in range(_ROUNDS):
@@ -152,7 +153,7 @@ def look(
             )
         )
         if choose:
-            widths = _widths(tiles, photons, change, passes * paths).ravel()
+            widths = _widths(tiles, photons, change, _PASSES * paths).ravel()
         area = float(np.mean((widths / narrow) ** 2))
         thinner = float(np.mean((narrow / widths) ** 2)) * emitted / paths
         gather = _GATHER * points_each + _MET * met * area * paths / emitted

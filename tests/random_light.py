@@ -365,9 +365,8 @@ def receivers(scene):
     return [shape for shape in scene.shapes() if shape.id() in RECEIVERS]
 
 
-def from_emitter_sampling(scene, sides, count, seed, wavelengths):
-    """Flux that arrives at random points of the receivers, by Mitsuba's emitter sampling."""
-    total = 0
+def _random_points(scene, count, seed, wavelengths):
+    """(receiver, sampler, sampled positions, the same as interactions) of each receiver."""
     for number, shape in enumerate(receivers(scene)):
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(seed + number, count)
@@ -376,6 +375,13 @@ def from_emitter_sampling(scene, sides, count, seed, wavelengths):
         si.p, si.n = point.p, point.n
         if wavelengths is not None:
             si.wavelengths = wavelengths
+        yield shape, sampler, point, si
+
+
+def from_emitter_sampling(scene, sides, count, seed, wavelengths):
+    """Flux that arrives at random points of the receivers, by Mitsuba's emitter sampling."""
+    total = 0
+    for shape, sampler, point, si in _random_points(scene, count, seed, wavelengths):
         ds, radiance = scene.sample_emitter_direction(si, sampler.next_2d())
         power = weighed(radiance) * dr.abs(dr.dot(ds.d, si.n)) / point.pdf
         is_shell = mi.Bool(shape.id() == "shell")
@@ -388,14 +394,7 @@ def from_rays(scene, sides, count, seed, wavelengths):
     bounding sphere from outside of that, else into all directions."""
     lights = [shape for shape in scene.shapes() if shape.is_emitter()]
     total = 0
-    for number, shape in enumerate(receivers(scene)):
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed + number, count)
-        point = shape.sample_position(mi.Float(0), sampler.next_2d())
-        si = dr.zeros(mi.SurfaceInteraction3f, count)
-        si.p, si.n = point.p, point.n
-        if wavelengths is not None:
-            si.wavelengths = wavelengths
+    for shape, sampler, point, si in _random_points(scene, count, seed, wavelengths):
         least, axis = mi.Float(-1), mi.Vector3f(0, 0, 1)
         if lights:
             ball = lights[0].bbox().bounding_sphere()

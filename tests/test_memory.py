@@ -237,20 +237,22 @@ def test_this_machine_has_memory():
 
 
 def kernels(scene, **parameters):
-    """Hashes of all kernels of a rendering."""
+    """Hashes of all kernels of a rendering in which anything is traced or gathered; Dr.Jit orders
+    what small ones do by where its arrays lie."""
     plugin = mi.load_dict(SMALL | parameters)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         plugin.render(scene, spp=4)
         history = dr.kernel_history()
-    return [k["hash"] for k in history if k["type"] == dr.KernelType.JIT], plugin
+    history = [k for k in history if k["type"] == dr.KernelType.JIT]
+    return sorted(k["hash"] for k in history if k["operation_count"] > 300), plugin
 
 
 def test_auto_is_no_map_in_a_plain_room_as_the_caustic_map_is():
     scene = mi.load_dict(room(size=8))
     auto, plugin = kernels(scene, map="auto")
     caustic, whole = (kernels(scene, map=name)[0] for name in ("caustic", "global"))
-    assert len(auto) == len(caustic) < len(whole)
+    assert auto == caustic != whole
     assert plugin.statistics["map"] == "none" and plugin.statistics["photons_emitted"] == 0
 
 

@@ -16,7 +16,7 @@ from aniso_pm.settings import Settings
 from aniso_pm.state import Checkpoint, State
 from aniso_pm.stopping import Stopping
 from passes import SMALL, close, integrator, load, render
-from rooms import room
+from rooms import room, room_with_ball
 
 
 @pytest.fixture(autouse=True)
@@ -104,6 +104,20 @@ def test_automatic_photon_count_is_kept_when_resuming(tmp_path):
     plugin = integrator(photon_count=0, passes=3)
     render(scene, plugin, 12, checkpoint=Checkpoint(path, resume=True))
     assert plugin.statistics["photons_emitted"] == 3 * chosen + 1
+
+
+@pytest.mark.parametrize("parts", [(2, 2), (1, 3)])
+def test_passes_that_choose_everything_add_up_too(tmp_path, parts):
+    """Resumed, with what a pilot chose for every pixel, and whatever their number was to be."""
+    scene = mi.load_dict(room_with_ball(size=24))
+    own = {"photon_count": 0, "initial_radius": 0.0}
+    whole = render(scene, integrator(passes=4, **own), 4 * 8)
+    path = tmp_path / "a.state"
+    render(scene, integrator(passes=parts[0], **own), parts[0] * 8, checkpoint=Checkpoint(path))
+    resumed = integrator(passes=4, **own)
+    image = render(scene, resumed, 4 * 8, checkpoint=Checkpoint(path, resume=True))
+    assert resumed.statistics["passes"] == 4
+    np.testing.assert_allclose(image, whole, rtol=1e-4, atol=1e-6)
 
 
 # --- Variance ---

@@ -77,7 +77,7 @@ def explain(
         border = (width.shape[1] - sensor.film().crop_size().x) // 2
         row, column = (pixel[k] - sensor.film().crop_offset()[k] + border for k in (1, 0))
         seen = footprint.of(sensor, radius0, float(width[row, column]))
-        prepared = replace(prepared, footprint=seen.in_pass(pass_index, settings.passes))
+        prepared = replace(prepared, footprint=seen.in_pass(pass_index))
     radius = bandwidth(radius0, settings.alpha, pass_index)
     colour = wavelength_sample(seed, pass_index)
     wavelengths = film.wavelengths(sensor, colour) if mi.is_spectral else None
