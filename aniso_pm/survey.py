@@ -26,7 +26,7 @@ is smooth and as √w in the mean around an edge; between them, as w^1.5,
 
     bias²(w) = ⟨D D'⟩ (w/4)³/(2^1.5 − 1)²,    so    w⁵ = 2 B₁/(3 M N) · 4³ (2^1.5 − 1)²/⟨D D'⟩
 
-makes bias² + B₁/(w² M N) smallest after M = 8 passes. Means are taken over tiles and their
+makes bias² + B₁/(w² M N) smallest after M = 32 passes. Means are taken over tiles and their
 neighbours.
 """
 
@@ -50,7 +50,7 @@ _TILES, _SAMPLES = 4096, 4
 _NARROW, _WIDE = 4.0, 8.0
 _THINNEST, _WIDEST = 1.0, 8.0
 # Passes that the widths are right for, however many there will be: passes add up.
-_PASSES = 8
+_PASSES = 32
 # Smallest share of eye paths that gather, and smallest number of them in a pixel and pass.
 _LEAST_SHARE, _GATHERS_PER_PIXEL = 1 / 8, 2
 # Work of an eye path: of its first ray, of a vertex.
