@@ -48,7 +48,7 @@ from .prepared import PILOT, Prepared, stream_seed
 _TILES, _SAMPLES = 4096, 4
 # Widths of kernels that are compared, and the range of those that are chosen, in pixels.
 _NARROW, _WIDE = 4.0, 8.0
-_THINNEST, _WIDEST = 1.0, 8.0
+_THINNEST, _WIDEST = 1.0, 32.0
 # Passes that the widths are right for, however many there will be: passes add up.
 _PASSES = 32
 # Smallest share of eye paths that gather, and smallest number of them in a pixel and pass.
