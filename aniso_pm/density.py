@@ -163,7 +163,9 @@ def estimate(
     total = (mi.Spectrum(0), mi.Spectrum(0), mi.UInt32(0))
     reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active, whole)
     area = dr.pi * dr.sqrt(dr.squared_norm(kernel.s)) * dr.sqrt(dr.squared_norm(kernel.t))
-    return points.weight * reflected / (area * (KERNEL_MASS * photons.emitted)), count
+    # As a literal, their number would be compiled into the kernel.
+    paths = dr.opaque(mi.Float, photons.emitted)
+    return points.weight * reflected / (area * KERNEL_MASS * paths), count
 
 
 def _filter(points: GatherPoints, max_depth):

@@ -36,6 +36,7 @@ import numpy as np
 from .amends import Amends, amends
 from .emitters import refuse, refuse_scale
 from .ndf import children
+from .spectra import channel_mean
 
 _FLOOR = 0.05
 _PILOT_RAYS = 256
@@ -86,7 +87,7 @@ class Environment:
         across the rays (within about 1 %)."""
         ray, flux = self.emitter.sample_ray(mi.Float(0), *_random(1 << 16))
         distance = dr.norm(dr.cross(self.centre - ray.o, ray.d))
-        flux = dr.mean(flux)
+        flux = channel_mean(flux)
         inside = dr.select(distance < 0.5 * self.radius, flux, 0)
         return 4 * float((dr.sum(inside) / dr.sum(flux))[0])
 
@@ -212,7 +213,7 @@ def prepare(scene) -> Emission:
     emitter = dr.gather(mi.EmitterPtr, emitters, index)
     u1, u2, u3 = _random(count * _PILOT_RAYS)
     _, flux = even._leave(index, emitter, mi.Float(0), u1, u2, u3, True, None)
-    flux = dr.mean(flux)
+    flux = channel_mean(flux)
     flux = dr.select(dr.isfinite(flux), flux, 0)
     power = dr.block_sum(flux, _PILOT_RAYS).numpy().astype(np.float64) * weight
     share = power / power.sum() if power.sum() > 0 else seen / seen.sum()

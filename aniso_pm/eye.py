@@ -26,6 +26,7 @@ from .index import curve_order
 from .lobe_path import LobeOnPath, follow, no_lobe
 from .rays import largest_coordinate, spawn_ray
 from .receivers import gathered_part, read_receiver
+from .spectra import channel_mean
 
 
 @dataclass
@@ -322,7 +323,7 @@ def _walk(scene, sampler, ray, options, push, see):
         else:
             # The path goes on with one of the parts, chosen by its share.
             before = scattered
-            chance = dr.mean(g)
+            chance = channel_mean(g)
             gathers = sampler.next_1d(active) < chance
             β = β_direct * dr.select(gathers, g / chance, (1 - g) / (1 - chance))
             if dr.hint(o.use == "final_gather", mode="scalar"):

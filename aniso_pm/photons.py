@@ -35,6 +35,7 @@ from . import index as spatial
 from .emission import Emission, only_photons_see
 from .rays import largest_coordinate, spawn_ray
 from .receivers import gathered_part, read_bent, read_receiver
+from .spectra import channel_mean
 
 # Light paths traced at once: bounds the memory of a wavefront, not the number of photons.
 WAVEFRONT = 1 << 21
@@ -260,9 +261,8 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefro
         room = dr.opaque(mi.UInt32, capacity)
         for first in range(0, photon_count, wavefront):
             sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(
-                mi.sample_tea_32(seed, first // wavefront)[0], min(wavefront, photon_count - first)
-            )
+            own = mi.sample_tea_32(seed, first // wavefront)[0]
+            sampler.seed(dr.opaque(mi.UInt32, own), min(wavefront, photon_count - first))
             photons, stored, rejected = launch(
                 scene, source, sampler, options, photons, stored, rejected, room
             )
@@ -375,7 +375,7 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
                 f_g = gathered_part(bsdf, viewed, si.wi, o.roughness, smooth)
                 f = bsdf.eval(mi.BSDFContext(), viewed, si.wi, smooth)
                 g = dr.select(smooth & (f > 0), dr.clip(f_g / f, 0, 1), 0)
-                chance = dr.mean(g)
+                chance = channel_mean(g)
                 gathers = is_receiver & (lambertian | (sampler.next_1d(active) < chance))
                 part = dr.select(gathers, g / chance, (1 - g) / (1 - chance))
                 β = dr.select(mixed, β * part, β)

@@ -34,7 +34,7 @@ _SMALLEST, LARGEST, _STEPS = 1.2e-5, 0.1, 14
 def camera_rays(sensor, seed: int):
     """Rays through random points of the film's crop window."""
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(stream_seed(seed, PILOT, 2), _RAYS)
+    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 2)), _RAYS)
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, _ = sensor.sample_ray(
         mi.Float(sensor.shutter_open()), mi.Float(0.5), sampler.next_2d(), aperture
@@ -118,7 +118,7 @@ def automatic_radius(scene: Prepared, rays, seed: int, map_=None) -> float:
         return 0.01 * extent
     count = dr.width(rays)
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(stream_seed(seed, PILOT, 1), count)
+    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 1)), count)
     _, _, points = scene.trace(sampler, rays)
     if points is None:
         return 0.01 * extent

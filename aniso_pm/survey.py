@@ -43,6 +43,7 @@ from . import footprint
 from .allotment import in_proportion
 from .film import rays_through, sampled_size, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
+from .spectra import channel_mean
 
 # Tiles of the picture at most, and stratified samples of each half of the pair in a tile's pixel.
 _TILES, _SAMPLES = 4096, 4
@@ -109,7 +110,7 @@ def look(
 
     L, _, points = scene.trace(sampler, ray, see=see)
     work = _VERTEX * _pairwise(vertices).mean(1) + _CAMERA
-    rest = _pairwise(dr.mean(L) + dr.zeros(mi.Float, tiles.lanes))
+    rest = _pairwise(channel_mean(L) + dr.zeros(mi.Float, tiles.lanes))
     if points is None or not min(map_.stored for map_ in maps):
         noise = _within(rest, rest, tiles.weight(rest))
         counts = in_proportion(tiles.spread(noise, work), each)
@@ -189,7 +190,7 @@ def _gathered(scene, map_, radius, seed, points, colours, lanes):
     light, photons = dr.zeros(mi.Float, lanes), 0.0
     r = dr.opaque(mi.Float, radius)
     for found in scene.gather(map_, r, seed, points, colours):
-        dr.scatter_add(light, dr.mean(found.radiance), found.lane)
+        dr.scatter_add(light, channel_mean(found.radiance), found.lane)
         photons += float(dr.sum(mi.Float(found.photons))[0]) / lanes
     return _pairwise(light), photons
 
@@ -245,7 +246,7 @@ class _Tiles:
         """On the film, of all lanes, tiles row by row."""
         film = sensor.film()
         tile = dr.arange(mi.UInt32, self.lanes) // (2 * _SAMPLES)
-        a, b = mi.sample_tea_32(tile, stream_seed(seed, PILOT, 4))
+        a, b = mi.sample_tea_32(tile, dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 4)))
         x = dr.minimum((tile % self.across) * self.edge + a % self.edge, self.width - 1)
         y = dr.minimum((tile // self.across) * self.edge + b % self.edge, self.height - 1)
         border = (self.width - film.crop_size().x) // 2
