@@ -293,7 +293,7 @@ class Prepared:
             gathered = self.gather(map_, radius, seed, points, map_.wavelengths)
             L = mi.Spectrum(L)
             for found in gathered:
-                # Directly: sums of each thread's own would have their size as a literal in the code.
+                # Directly: sums of each thread's own would have their size in the code.
                 dr.scatter_add(L, found.radiance, found.lane, mode=dr.ReduceMode.Direct)
             dr.eval(L)
         lap("gather")

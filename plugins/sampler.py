@@ -91,7 +91,10 @@ class OwenSobol:
         """Each lane at sample number ``sample`` of the sequence of its ``pixel`` (UInt32)."""
         self._width = max(dr.width(pixel), dr.width(sample))
         self.index = mi.UInt32(sample)
-        self.random = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, seed) + self._base_seed)[0]
+        # Evaluated, so that it is no part of the kernel's code.
+        seed = mi.UInt32(seed) + self._base_seed
+        dr.make_opaque(seed)
+        self.random = mi.sample_tea_32(pixel, seed)[0]
         self.dimension = mi.UInt32(0)
         dr.eval(self.index, self.random)
 
