@@ -10,8 +10,11 @@ caustic       the map holds caustics alone: light → walked parts → gathered 
               with both parts, and drops emission and direct light that reach a gathered part over
               one walked part or more, because the map has them.
 final gather  "caustic" up to the first gathered part, "global" from there on.
+none          there is no map: path tracing.
+survey        "caustic", with what the other uses would have done told apart (see ``Parts``): for
+              the pilot that chooses between them.
 
-Each light path is counted exactly once in all three.
+Each light path is counted exactly once in all of them.
 """
 
 from __future__ import annotations
@@ -60,11 +63,26 @@ class Thinning:
         return u < self.share
 
 
+@dataclass
+class Parts:
+    """What the survey's eye paths see.
+
+    radiance  as with use "caustic": W/m²/sr.
+    later     the part of it that was found beyond a gathered part, which the global map has:
+              radiance in the mean over channels.
+    caustic   what was found over walked parts beyond a gathered part, which both maps have.
+    """
+
+    radiance: Any
+    later: Any
+    caustic: Any
+
+
 @dataclass  # not frozen: Dr.Jit writes back whatever a loop mentions
 class WalkOptions:
     """Decisions for one scene; what is off is not traced.
 
-    use            "global", "caustic" or "final_gather", see above.
+    use            see above.
     max_depth      segments of the longest light path.
     rr_depth       segments after which Russian roulette begins.
     min_segments   segments of the shortest light path that the map holds (2; 1 where the scene has
@@ -104,7 +122,8 @@ class GatherPoints:
     path       LobeOnPath, or None where the scene has no anisotropic lobes.
     origin, d  ray that found p, or None where all receivers are Lambertian.
     lambertian is the receiver Lambertian? None where all are.
-    caustic    only caustic photons are to be read; None where all points agree.
+    caustic    only caustic photons are to be read; None where all points agree. (survey: they are
+               the map's only if it holds caustics alone.)
     distance   length of the path from the camera, world units; None where nobody asks.
     """
 
@@ -146,7 +165,7 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     """Trace camera paths: (radiance, valid, GatherPoints or None).
 
     radiance  W/m²/sr: emission, direct light, and whatever the map does not stand for. NaN where
-              the throughput at a gather point is not finite.
+              the throughput at a gather point is not finite. Parts where use is "survey".
     valid     did the ray meet anything but null surfaces and, if they are hidden, emitters?
               (alpha, as in ``path``)
     expected  gather points to make room for; with too few the same paths are traced again.
@@ -180,7 +199,8 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
 
 def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room, see=None):
     """One wavefront of eye paths, gather points into their columns: (radiance, valid, rows used,
-    columns). see: called as see(lane, depth, si, bsdf, bs, active) where paths scatter."""
+    columns). see: called as see(lane, depth, si, bsdf, bs, active, scattered) where paths scatter;
+    scattered: have they left a gathered part before?"""
 
     def push(point, active):
         slot = dr.scatter_inc(rows, mi.UInt32(0), active)
@@ -212,7 +232,7 @@ def _point(o: WalkOptions, lane, si, ray, weight, depth, path, lambertian, scatt
         origin=ray.o if o.general else None,
         d=ray.d if o.general else None,
         lambertian=lambertian if o.general else None,
-        caustic=~scattered if o.use == "final_gather" else None,
+        caustic={"final_gather": ~scattered, "survey": scattered}.get(o.use),
         distance=distance if o.measure else None,
     )
 
@@ -246,6 +266,13 @@ def _walk(scene, sampler, ray, options, push, see):
     delta_prev = mi.Bool(True)  # Was it a delta distribution (or the camera)?
     path = _first_lobe(o)
     distance = mi.Float(0)  # Length of the path
+    # What the survey tells apart: found beyond a gathered part; over walked parts beyond one, and
+    # the throughput of emission there; had the path left a gathered part before its last vertex?
+    survey = o.use == "survey"
+    later = caustic = β_caustic = before = None
+    if dr.hint(survey, mode="scalar"):
+        later, caustic = mi.Float(0), mi.Float(0)
+        β_caustic, before = mi.Spectrum(0), mi.Bool(False)
     chosen, worth = mi.Bool(True), mi.Float(1)  # Does the path gather, and for how many others?
     if dr.hint(o.thinning is not None, mode="scalar"):
         chosen, worth = o.thinning.chosen(), dr.rcp(o.thinning.share)
@@ -264,7 +291,11 @@ def _walk(scene, sampler, ray, options, push, see):
             seen &= valid | si.is_valid()
         pdf_emitter = scene.pdf_emitter_direction(si_prev, ds, seen & ~delta_prev)
         mis = dr.select(delta_prev, 1, _power_heuristic(pdf_prev, pdf_emitter))
-        L[seen] = dr.fma(β_direct, mis * ds.emitter.eval(si, seen), L)
+        emission = mis * ds.emitter.eval(si, seen)
+        L[seen] = dr.fma(β_direct, emission, L)
+        if dr.hint(survey, mode="scalar"):
+            later[seen & before] += channel_mean(β_direct * emission)
+            caustic[seen & before] += channel_mean(β_caustic * emission)
         on_surface = active & si.is_valid()
         active &= si.is_valid() & (depth < max_depth) & (dr.max(β) > 0)
 
@@ -275,11 +306,15 @@ def _walk(scene, sampler, ray, options, push, see):
         sample_light &= ds.pdf != 0
         wo = si.to_local(ds.d)
         f, pdf = bsdf.eval_pdf(ctx, si, wo, sample_light)
-        if dr.hint(o.use != "global" and o.deep, mode="scalar"):
+        light *= β * dr.select(ds.delta, 1, _power_heuristic(ds.pdf, pdf))
+        if dr.hint(o.use not in ("global", "none") and o.deep, mode="scalar"):
             # Over a walked part to a gathered one: the map has it.
+            whole = f
             f = dr.select(scattered, gathered_part(bsdf, si, wo, o.roughness, sample_light), f)
-        mis = dr.select(ds.delta, 1, _power_heuristic(ds.pdf, pdf))
-        L[sample_light] = dr.fma(β, mis * f * light, L)
+            if dr.hint(survey, mode="scalar"):
+                later[sample_light & scattered] += channel_mean(f * light)
+                caustic[sample_light & scattered] += channel_mean((whole - f) * light)
+        L[sample_light] = dr.fma(f, light, L)
 
         # --- Leave a gather point ---
         is_receiver, lambertian, brdf = read_receiver(bsdf, si, o.roughness, o.general, active)
@@ -288,12 +323,12 @@ def _walk(scene, sampler, ray, options, push, see):
         here = is_receiver & (depth + o.min_segments <= max_depth)
         finite = dr.all(dr.isfinite(weight))
         here &= dr.max(weight) != 0
-        L[here & ~finite] = dr.nan  # counted and dropped later
         if dr.hint(o.follow_lobes, mode="scalar"):
             path.distance += dr.select(active, si.t, 0)
         if dr.hint(o.measure, mode="scalar"):
             distance += dr.select(active, si.t, 0)
         if dr.hint(o.gathers, mode="scalar"):
+            L[here & ~finite] = dr.nan  # counted and dropped later
             here &= chosen
             weight *= worth
             point = _point(o, lane, si, ray, weight, depth, path, lambertian, scattered, distance)
@@ -303,7 +338,7 @@ def _walk(scene, sampler, ray, options, push, see):
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         if dr.hint(see is not None, mode="scalar"):
-            see(lane, depth, si, bsdf, bs, active)
+            see(lane, depth, si, bsdf, bs, active, scattered)
         # Share of the gathered part in the sampled direction
         g = dr.select(is_receiver, mi.Spectrum(1), mi.Spectrum(0))
         if dr.hint(o.general, mode="scalar"):
@@ -318,18 +353,22 @@ def _walk(scene, sampler, ray, options, push, see):
         valid |= on_surface & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         ray = spawn_ray(si, si.to_world(bs.wo), reach)
         β_direct = β * weight
-        if dr.hint(o.use == "global", mode="scalar"):
+        if dr.hint(o.use == "none", mode="scalar"):
+            β = mi.Spectrum(β_direct)  # not the same array: both are scaled in place below
+        elif dr.hint(o.use == "global", mode="scalar"):
             β = β_direct * (1 - g)
         else:
             # The path goes on with one of the parts, chosen by its share.
-            before = scattered
             chance = channel_mean(g)
             gathers = sampler.next_1d(active) < chance
             β = β_direct * dr.select(gathers, g / chance, (1 - g) / (1 - chance))
             if dr.hint(o.use == "final_gather", mode="scalar"):
-                β = dr.select(before, β_direct * (1 - g), β)
+                β = dr.select(scattered, β_direct * (1 - g), β)
+            if dr.hint(survey, mode="scalar"):
+                before = mi.Bool(scattered)  # not the same array, which changes in place
+                β_caustic = dr.select(scattered, β_direct * (1 - g), 0)
+            β_direct = dr.select(scattered, β_direct * g, β_direct)
             scattered |= gathers
-            β_direct = dr.select(before, β_direct * g, β_direct)
         η *= bs.eta
         si_prev = mi.Interaction3f(si)
         pdf_prev = bs.pdf
@@ -344,8 +383,10 @@ def _walk(scene, sampler, ray, options, push, see):
             scale = dr.select(roulette, dr.rcp(survive), 1)
             β *= scale
             β_direct *= scale
+            if dr.hint(survey, mode="scalar"):
+                β_caustic *= scale
         depth += 1
-    return L, valid
+    return (Parts(L, later, caustic) if survey else L), valid
 
 
 def _power_heuristic(a, b):

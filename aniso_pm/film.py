@@ -7,6 +7,10 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+# Points at which a reconstruction filter is looked at.
+_STEPS = 1000
 
 
 def pixel_count(film) -> int:
@@ -149,6 +153,16 @@ def from_description(description: dict[str, Any]):
     )
     film.prepare([])
     return film
+
+
+def noise_share(film) -> float:
+    """Variance of a pixel whose samples the reconstruction filter weights, as a share of that of
+    the plain mean of a pixel's own ones: ∫f²/(∫f)² over the plane, in pixels; 1 for a box."""
+    rfilter = film.rfilter()
+    radius = rfilter.radius()
+    x = mi.Float(((np.arange(_STEPS) + 0.5) / _STEPS * radius).astype(np.float32))
+    f = np.broadcast_to(rfilter.eval(x).numpy().astype(np.float64), _STEPS)
+    return float(((f**2).mean() / f.mean() ** 2 / (2 * radius)) ** 2)
 
 
 def _border(film) -> int:

@@ -25,7 +25,7 @@ count and the same paths are traced again: none is ever lost.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -129,12 +129,38 @@ def build_map(
         wavefront or WAVEFRONT,
     )
     lap("photons")
+    map_ = _indexed(photons, stored, PhotonMap(photon_count, 0, rejected, *[None] * 4))
+    lap("index")
+    return replace(map_, wavelengths=options.wavelengths)
+
+
+def caustics(map_: PhotonMap) -> PhotonMap:
+    """The caustic photons of a map that marks them, as a map of their own."""
+    if map_.stored == 0:
+        return map_
+    point = dr.gather(mi.Vector4f, map_.index.points, dr.arange(mi.UInt32, map_.stored))
+    word = dr.reinterpret_array(mi.UInt32, point.w)
+    slot = dr.compress(is_caustic(word))
+    point = dr.gather(mi.Vector4f, map_.index.points, slot)
+    photons = _Photons(
+        mi.Point3f(point.x, point.y, point.z),
+        dr.reinterpret_array(mi.UInt32, point.w),
+        photon_flux(map_, slot, True),
+        None if map_.direction is None else dr.gather(mi.UInt32, map_.direction, slot),
+    )
+    dr.eval(photons)
+    nothing = replace(map_, stored=0, index=None, flux=None, direction=None)
+    return _indexed(photons, dr.width(slot), nothing)
+
+
+def _indexed(photons: _Photons, stored: int, nothing: PhotonMap) -> PhotonMap:
+    """``nothing``, the map without a photon, with the first ``stored`` ones."""
     if stored == 0:
-        return PhotonMap(photon_count, 0, rejected, None, None, None, None)
+        return nothing
     index, order = spatial.build(_cut(photons, "position", stored), _cut(photons, "word", stored))
     # What has been put in order is dropped before the next column is.
     direction = None
-    if options.general:
+    if photons.direction is not None:
         direction = dr.gather(mi.UInt32, _cut(photons, "direction", stored), order)
         dr.eval(direction)
     sorted_flux = dr.empty(mi.Float, stored * _flux_width())
@@ -143,10 +169,7 @@ def build_map(
     del order, flux
     dr.eval(sorted_flux)
     spatial.give_back(stored)
-    lap("index")
-    return PhotonMap(
-        photon_count, stored, rejected, index, sorted_flux, direction, options.wavelengths
-    )
+    return replace(nothing, stored=stored, index=index, flux=sorted_flux, direction=direction)
 
 
 def photon_flux(photons: PhotonMap, slot, active):

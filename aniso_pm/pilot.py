@@ -9,13 +9,13 @@ by the light that it receives: a caustic on a dark floor sets the bandwidth, not
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import density, photons, survey
+from . import density, eye, photons, survey
 from .film import one_each, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 
@@ -46,6 +46,8 @@ def camera_rays(sensor, seed: int):
 class Settled:
     """What a rendering needs to know before its first pass, given or chosen.
 
+    use     of the map (see ``eye``).
+    errors  relative MSE that each use promises, where there was a choice (see ``survey``).
     count   light paths per pass.
     radius  bandwidth of the first pass, world units.
     share   of the eye paths that gather (see ``eye.Thinning``).
@@ -53,6 +55,8 @@ class Settled:
     widths  of the kernels of each pixel, in pixels (see ``footprint``).
     """
 
+    use: str
+    errors: dict[str, float | None]
     count: int
     radius: float
     share: float
@@ -66,23 +70,18 @@ def settle(scene: Prepared, sensor, seed: int, each: int, count=None, radius=Non
     each: eye samples of a pixel in a pass.
     """
     colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
+    if scene.undecided:
+        scene = replace(scene, chosen="survey")
     pilot = scene.with_(photon_count=_PATHS)
     maps = [
         pilot.photon_map(stream_seed(seed, PILOT), k, wavelengths=colours) if scene.needs_map
         else photons.EMPTY
         for k in (0, 1)
     ]  # fmt: skip
-    automatic, reference = not radius, count or USUAL
-    if not radius:
-        radius = automatic_radius(
-            scene.with_(photon_count=reference), camera_rays(sensor, seed), seed, maps[0]
-        )
-    found = survey.look(scene, sensor, radius, seed, each, maps, count, automatic)
-    if not count:
-        count = min(max(_rounded(found.light_paths), FEWEST), MOST)
-        if automatic:
-            radius = min(radius * math.sqrt(reference / count), LARGEST * scene.extent)
-    return Settled(count, radius, found.share, found.counts, found.widths)
+    found = survey.look(scene, sensor, radius, seed, each, maps, count)
+    count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
+    radius = radius or radius_at(found.points, found.map, scene, count)
+    return Settled(found.use, found.errors, count, radius, found.share, found.counts, found.widths)
 
 
 def _rounded(number: float) -> int:
@@ -105,24 +104,31 @@ def photons_per_path(scene: Prepared, seed: int) -> float:
 
 
 def automatic_radius(scene: Prepared, rays, seed: int, map_=None) -> float:
-    """Bandwidth (world units) at which kernels hold PHOTONS_PER_KERNEL photons in the median.
-
-    rays: any number of camera rays. map_: a pilot's, if there is one. Returns a hundredth of the
-    scene's extent where there is nothing to gather, and never more than a tenth of it.
-    """
-    extent = scene.extent
+    """As :func:`radius_at`, for what any number of camera rays see. map_: a pilot's, if there is
+    one."""
     if map_ is None:
         pilot = scene.with_(photon_count=min(scene.settings.photon_count, _PATHS))
         map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
-    if map_.stored == 0:
-        return 0.01 * extent
-    count = dr.width(rays)
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 1)), count)
-    _, _, points = scene.trace(sampler, rays)
-    if points is None:
+    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 1)), dr.width(rays))
+    points = scene.trace(sampler, rays)[2] if map_.stored else None
+    return radius_at(points, map_, scene, scene.settings.photon_count)
+
+
+def radius_at(points, map_, scene: Prepared, light_paths: int) -> float:
+    """Bandwidth (world units) at which kernels hold PHOTONS_PER_KERNEL photons of so many light
+    paths, in the median over gather points (GatherPoints or None).
+
+    Returns a hundredth of the scene's extent where there is nothing to gather, and never more than
+    a tenth of it.
+    """
+    extent = scene.extent
+    if points is None or not map_.stored:
         return 0.01 * extent
     count = dr.width(points.lane)
+    if count > _RAYS:
+        points = eye.take(points, dr.arange(mi.UInt32, _RAYS) * (count // _RAYS))
+        count = _RAYS
     radius = dr.full(mi.Float, _SMALLEST * extent, count)
     looking = dr.full(mi.Bool, True, count)
     dr.eval(looking, radius)
@@ -138,5 +144,5 @@ def automatic_radius(scene: Prepared, rays, seed: int, map_=None) -> float:
         if not dr.any(looking):
             break
     median = _weighted_median(radius.numpy())
-    more_photons = scene.settings.photon_count / map_.emitted
+    more_photons = light_paths / map_.emitted
     return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), LARGEST * extent)

@@ -58,6 +58,7 @@ class Prepared:
     launch: Launch = Launch()
     light_wavefront: int | None = None  # light paths at once; None: photons.WAVEFRONT
     footprint: Footprint | None = None  # of pixels; None: one bandwidth for all of a pass
+    chosen: str | None = None  # use of the map that a pilot has found best, see ``undecided``
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -92,15 +93,34 @@ class Prepared:
         return len(self.needs.chains) > 0
 
     @property
+    def undecided(self) -> bool:
+        """Is it for a pilot to say how the map is best used? ``map=auto`` has no choice where there
+        are no surfaces that paths walk on (nothing casts caustics: path tracing is best), nor where
+        there is light that only photons find (it takes the global map)."""
+        automatic = self.settings.map == "auto" and not self.settings.final_gather
+        return automatic and self.use == "global" and not self.needs.unseen and not self.chosen
+
+    @property
     def use(self) -> str:
-        """How eye paths use the map; see ``eye``. ``auto`` is "global" where light comes over
-        surfaces that paths walk on, or from emitters that only photons find. Elsewhere it is
-        "caustic", which stores and gathers nothing there: path tracing is faster."""
+        """How eye paths use the map; see ``eye``. As long as nobody has chosen, ``auto`` is
+        "global" where there is anything to choose."""
+        if self.chosen:
+            return self.chosen
+        wanted = bool(self.needs.receivers) and self.settings.depth_limit > self.min_segments
+        if not wanted or self.emission is None:
+            return "none"
         if self.settings.final_gather:
             return "final_gather"
-        if self.settings.map == "auto":
-            return "global" if self.deep or self.needs.unseen else "caustic"
-        return self.settings.map
+        if not self.deep and not self.needs.unseen and self.settings.map != "global":
+            return "none"
+        return "global" if self.settings.map == "auto" else self.settings.map
+
+    @property
+    def path_tracing_suffices(self) -> bool:
+        """Can eye paths find all light by themselves? Not if a point emits it, or a direction has
+        all of it: whatever such a light sends over a mirror is only found by photons."""
+        delta = mi.EmitterFlags.Delta
+        return not any(mi.has_flag(e.flags(), delta) for e in self.scene.emitters())
 
     @property
     def crowding(self) -> int:
@@ -120,9 +140,7 @@ class Prepared:
     @property
     def needs_map(self) -> bool:
         """Is there anything for photons to do?"""
-        wanted = bool(self.needs.receivers) and self.settings.depth_limit > self.min_segments
-        caustics_only = self.use == "caustic" and not self.needs.unseen
-        return wanted and self.emission is not None and (self.deep or not caustics_only)
+        return self.use != "none"
 
     @property
     def bytes_per_photon(self) -> int:
@@ -168,7 +186,7 @@ class Prepared:
         options = photons.TraceOptions(
             s.depth_limit - 1,
             s.rr_depth,
-            {"global": "ignored", "final_gather": "marked", "caustic": "only"}[self.use],
+            {"global": "ignored", "caustic": "only"}.get(self.use, "marked"),
             bool(self.needs.general),
             s.gather_roughness,
             bool(self.needs.unseen),

@@ -70,9 +70,11 @@ class Controls:
 
 @dataclass
 class Rendered:
-    """What is left of a rendering beside the film: map and radius of the last pass (None if no
-    pass was rendered), variance of the picture (None with one pass)."""
+    """What is left of a rendering beside the film: the scene with what was chosen for it, map and
+    radius of the last pass (None if no pass was rendered), variance of the picture (None with one
+    pass)."""
 
+    scene: Prepared
     map: Any
     radius: float | None
     variance: np.ndarray | None
@@ -101,7 +103,8 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
         run.stopping.close()
     run.finish()
     advice.after(scene, statistics)
-    return Rendered(run.map, run.radius, run.variance)
+    decided = replace(run.scene.thawed(), footprint=None)
+    return Rendered(decided, run.map, run.radius, run.variance)
 
 
 class _Done(NamedTuple):
@@ -155,6 +158,8 @@ class _Run:
         # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
         given = settings.photon_count or None, settings.initial_radius or None
         found = settle(self.scene, self.sensor, self.seed, each, *given)
+        use = known.get("use of the map") or found.use
+        self.scene = replace(self.scene, chosen=use)
         count = given[0] or known.get("photon count") or found.count
         self.radius0 = given[1] or known.get("initial radius") or found.radius
         self.share = known.get("share of gathers") or found.share
@@ -174,6 +179,7 @@ class _Run:
         if checkpoint:
             self.identity = digest.identity(self.scene, self.sensor, self.seed, self.shares.text)
             self.identity |= {
+                "use of the map": use,
                 "initial radius": self.radius0,
                 "photon count": count,
                 "share of gathers": self.share,
@@ -184,7 +190,8 @@ class _Run:
             "share_of_gathers": self.share,
             "photon_count": count,
             "photon_count_automatic": settings.photon_count == 0,
-            "map": self.scene.use if self.scene.needs_map else "none",
+            "map": use,
+            "map_errors": found.errors,
             "memory_estimate": self.plan.bytes / memory.GIB,
             "wavefront_light_paths": self.plan.light_paths,
             "wavefront_eye_samples": self.plan.eye_samples,

@@ -1,5 +1,6 @@
-"""What pairs of eye paths tell before the first pass: how many of them should gather, how many
-light paths they are worth, how wide kernels should be, and which pixels need more samples.
+"""What pairs of eye paths tell before the first pass: how the map is best used, how many of them
+should gather, how many light paths they are worth, how wide kernels should be, and which pixels
+need more samples.
 
 Two independent means a, b over k = 4 stratified samples of one pixel are read from two independent
 photon maps A, B. With the gathered light g and all the rest l, weighted by 1/(mean² + floor²) so
@@ -11,10 +12,11 @@ that errors are relative,
     V_p = ⟨(g_aA − g_aB)(g_bA − g_bB)⟩/2       of photons that a pixel's samples share.
 
 A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot)
-has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)), and costs
-n P (1 + q C_g) + N C_p, P the number of pixels. For given n, variance times cost is smallest at
+has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths being
+what the film's filter leaves of it), and costs
+n P (C + q C_g) + N C_p, P the number of pixels. For given n, variance times cost is smallest at
 
-    q² = (V_g + V_gp)/(V_r C_g),        N² = n² P (1 + q C_g) B / (A C_p),
+    q² = C (V_g + V_gp)/(V_r C_g),        N² = n² P (C + q C_g) B / (A C_p),
 
 and with samples of a pixel in proportion to √((V_r + (V_g + V_gp)/q)/C) there, C the work of an eye
 path of that pixel. Costs are counted, not timed, so that every machine decides alike.
@@ -28,20 +30,31 @@ is smooth and as √w in the mean around an edge; between them, as w^1.5,
 
 makes bias² + B₁/(w² M N) smallest after M = 32 passes. Means are taken over tiles and their
 neighbours.
+
+*Use of the map.* Where it is open (``Prepared.undecided``), the eye paths of the pilot go on as in
+path tracing and tell apart what each use leaves to them (see ``eye.Parts``). The use of the least
+
+    bias² + (A/n + B/N) (n P (C + q C_g) + N C_p) / (M n P C_0)
+
+is chosen, its error after the work of M passes of path tracing, C_0 for each path. Path tracing finds some caustics by
+rare hits that a pilot may miss, so that their variance seems small; it is chosen only where it has
+found the caustics that the map holds, by many hits.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import footprint
-from .allotment import in_proportion
-from .film import rays_through, sampled_size, wavelengths
+from . import eye, footprint, photons
+from .allotment import LEAST, MOST, in_proportion
+from .film import noise_share, rays_through, sampled_size, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 from .spectra import channel_mean
 
@@ -58,121 +71,303 @@ _LEAST_SHARE, _GATHERS_PER_PIXEL = 1 / 8, 2
 _CAMERA, _VERTEX = 0.3, 0.4
 # Work of a gather, each photon it meets, a light path, a photon it leaves; an eye path is about 1.
 _GATHER, _MET, _LIGHT_PATH, _LEFT = 1.2, 1 / 40, 0.6, 0.4
-# Variance of an eye sample among many stratified ones, as a share of that among _SAMPLES.
-_STRATIFIED = 0.3
+# Variance of an eye sample among a few hundred stratified ones, as a share of that among _SAMPLES:
+# 0.59 among 52 and falling, in direct light.
+_STRATIFIED = 0.45
 # A tile's numbers count by so much, the rest is the picture's mean.
 _TRUST = 0.85
+# Uneven samples have to promise so much less work for the same error: they are a tenth slower.
+_WORTH = 1.15
 # Rounds in which the decisions, each of which depends on the others, settle.
 _ROUNDS = 4
+
+
+# Variance beyond the first gathered part, where stratification does less, as such a share.
+_LATER_STRATIFIED = 0.85
+# Another use of the map than "global" has to promise an error smaller by so much.
+_BETTER = 0.9
+# Path tracing has found the caustics if it has so much of their light, by as many hits.
+_FOUND, _HITS = 0.7, 64
 
 
 @dataclass(frozen=True)
 class Survey:
     """What was found.
 
+    use          of the map (see ``eye``).
+    errors       relative MSE that each use promises, by its name, where there was a choice; None
+                 where path tracing has not found what the map holds.
     share        of the eye paths that should gather (see ``eye.Thinning``).
     light_paths  of a pass; 0 where photons do not show.
     counts       samples of each pixel (see ``allotment``), or None: all alike.
     widths       of the kernels of each pixel, in pixels.
+    map, points  a map of that use, and where eye paths read it (GatherPoints); None where none do.
     """
 
+    use: str
+    errors: dict[str, float | None]
     share: float
     light_paths: float
     counts: np.ndarray | None
     widths: np.ndarray
+    map: photons.PhotonMap | None
+    points: Any
 
 
 def look(
-    scene: Prepared, sensor, radius: float, seed: int, each: int, maps, light_paths, choose: bool
+    scene: Prepared, sensor, radius: float | None, seed: int, each: int, maps, light_paths
 ) -> Survey:
     """Trace the pairs, and decide.
 
-    radius       bandwidth of the first pass, world units.
+    scene        where the use of the map is open: with ``chosen`` "survey".
+    radius       bandwidth of the first pass, world units, if it is given: all kernels have it.
     each         eye samples of a pixel in a pass, in the mean.
     maps         two independent photon maps of as many light paths, or empty ones.
     light_paths  of a pass if they are given, else 0 or None.
-    choose       widths of kernels; else all have ``radius``.
     """
     tiles = _Tiles.of(sensor)
+    seen = _trace(scene, sensor, tiles, seed)
+    read = partial(_read, scene, sensor, radius, seed, tiles.lanes)
+    filtered = noise_share(sensor.film())
+    decide = partial(_Plan.of, tiles, radius is None, each, light_paths, filtered, seen.work)
+    if seen.points is None or not min(map_.stored for map_ in maps):
+        use = scene.use
+        if use == "survey":
+            use = "none" if scene.path_tracing_suffices else "caustic"
+        light = seen.own + seen.later + (0 if use == "caustic" else seen.caustic)
+        weight = tiles.weight(light)
+        return decide(use, weight, _within(light, light, weight)).survey({}, None, None)
+    own = seen.own
+    if scene.use != "survey":
+        found = read(maps, seen.points)
+        weight = tiles.weight(own + found.light)
+        plan = decide(scene.use, weight, _within(own, own, weight), found)
+        return plan.survey({}, maps[0], seen.points)
+
+    # --- The global map ---
+    first = eye.take(seen.points, dr.compress(~seen.points.caustic))
+    found = read(maps, first)
+    weight = tiles.weight(own + found.light)
+    v_own = _within(own, own, weight)
+    best = decide("global", weight, v_own, found, work=seen.early)
+    errors: dict[str, float | None] = {"global": best.error}
+    chosen, limit = (maps[0], first), _BETTER * best.error
+
+    # --- The other ones, unless their eye paths alone are too dear ---
+    light = own + seen.later
+    more = _within(light, light, weight) - v_own
+    bare = decide("none", weight, v_own, later=more)
+    if bare.error < limit:
+        maps = [photons.caustics(map_) for map_ in maps]
+        any_ = replace(seen.points, caustic=dr.full(mi.Bool, False, dr.width(seen.points.lane)))
+        found = read(maps, any_)
+        plan = decide("caustic", weight, v_own, found, later=more)
+        errors["caustic"] = plan.error
+        if plan.error < limit:
+            best, chosen, limit = plan, (maps[0], any_), plan.error
+        if scene.path_tracing_suffices:
+            errors["none"] = None
+            if _has_found(seen.caustic, found.light, weight):
+                light = light + seen.caustic
+                more = _within(light, light, weight) - v_own
+                plan = decide("none", weight, v_own, later=more)
+                errors["none"] = plan.error
+                if plan.error < limit:
+                    best, chosen = plan, (None, None)
+    return best.survey(errors, *chosen)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the pairs of eye paths saw, as (pairs, 2) but work, early (pairs).
+
+    own      light that every use leaves to eye paths.
+    later    light that the global map has, the caustic one not.
+    caustic  light that both have.
+    work     of the whole path; early: of the path up to its first gathered part.
+    points   where they gather, or None.
+    """
+
+    own: np.ndarray
+    later: np.ndarray
+    caustic: np.ndarray
+    work: np.ndarray
+    early: np.ndarray
+    points: Any
+
+
+def _trace(scene: Prepared, sensor, tiles: _Tiles, seed: int) -> _Seen:
     sampler = mi.load_dict({"type": "owen_sobol"})
     lane = dr.arange(mi.UInt32, tiles.lanes)
     sampler.begin(stream_seed(seed, PILOT, 3), lane // _SAMPLES, lane % _SAMPLES)
     ray, _ = rays_through(sensor, sampler, tiles.positions(sensor, seed, sampler), 0.5)
-    if choose:  # kernels as wide as they are told to be
-        radius = 0.1 * scene.extent
-    free = replace(footprint.of(sensor, radius), least=dr.opaque(mi.Float, 1e-6))
-    if choose:
-        scene = replace(scene, footprint=free)
-    vertices = dr.zeros(mi.Float, tiles.lanes)
+    scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
+    vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
 
-    def see(lane, depth, si, bsdf, bs, active):
+    def see(lane, depth, si, bsdf, bs, active, scattered):
         dr.scatter_add(vertices, mi.Float(1), lane, active)
+        dr.scatter_add(early, mi.Float(1), lane, active & ~scattered)
 
-    L, _, points = scene.trace(sampler, ray, see=see)
-    work = _VERTEX * _pairwise(vertices).mean(1) + _CAMERA
-    rest = _pairwise(channel_mean(L) + dr.zeros(mi.Float, tiles.lanes))
-    if points is None or not min(map_.stored for map_ in maps):
-        noise = _within(rest, rest, tiles.weight(rest))
-        counts = in_proportion(tiles.spread(noise, work), each)
-        return Survey(1.0, 0.0, counts, np.ones(1))
+    room = 3 * tiles.lanes if scene.use == "survey" else 0
+    L, _, points = scene.trace(sampler, ray, room, see=see)
+    later = caustic = mi.Float(0)
+    if isinstance(L, eye.Parts):
+        L, later, caustic = L.radiance, L.later, L.caustic
+    none = dr.zeros(mi.Float, tiles.lanes)
+    later, caustic = _pairwise(later + none), _pairwise(caustic + none)
+    own = _pairwise(channel_mean(L) + none) - later
+    work, early = (_VERTEX * _pairwise(v).mean(1) + _CAMERA for v in (vertices, early))
+    return _Seen(own, later, caustic, work, early, points)
 
-    # --- Gathered light of a wide and a narrow kernel, from either map ---
+
+@dataclass(frozen=True)
+class _Found:
+    """What a use of the map gives to the pairs: light from map a, b through narrow kernels and
+    through wide ones, (pairs, 2); photons that an eye path meets, gather points that it leaves;
+    light paths and photons of a map."""
+
+    a: np.ndarray
+    b: np.ndarray
+    wide_a: np.ndarray
+    wide_b: np.ndarray
+    met: float
+    points: float
+    emitted: int
+    stored: int
+
+    @property
+    def light(self) -> np.ndarray:
+        return 0.5 * (self.wide_a + self.wide_b)
+
+
+def _read(scene: Prepared, sensor, radius, seed: int, lanes: int, maps, points) -> _Found:
     colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
-    gathered = []
-    for width in (_NARROW, _WIDE) if choose else (1.0,):
-        if choose:
-            free = replace(free, widths=dr.opaque(mi.Float, width))
+    found = []
+    for width in (_NARROW, _WIDE) if not radius else (1.0,):
+        size = radius
+        if not radius:  # kernels as wide as they are told to be
+            size = 0.1 * scene.extent
+            free = footprint.of(sensor, size, width)
+            free = replace(free, least=dr.opaque(mi.Float, 1e-6))
             scene = replace(scene, footprint=free)
-        gathered.append(
-            [_gathered(scene, map_, radius, seed, points, colours, tiles.lanes) for map_ in maps]
-        )
-    (a, met), (b, _) = gathered[0]
-    wide_a, wide_b = gathered[-1][0][0], gathered[-1][1][0]
-    emitted, points_each = maps[0].emitted, dr.width(points.lane) / tiles.lanes
+        found.append([_gathered(scene, m, size, seed, points, colours, lanes) for m in maps])
+    (a, met), (b, _) = found[0]
+    (wide_a, _), (wide_b, _) = found[-1]
+    each = dr.width(points.lane) / lanes
+    return _Found(a, b, wide_a, wide_b, met, each, maps[0].emitted, maps[0].stored)
 
-    # --- Variances and bias² of each pair, relative to the light there ---
-    weight = tiles.weight(rest + 0.5 * (wide_a + wide_b))
-    v_rest = _within(rest, rest, weight)
-    v_gather = max(0.0, float(_within(a, b, weight).mean()))
-    shared, alone = _of_photons(wide_a - wide_b, weight)
-    mid_shared, mid_alone = _of_photons(a - b, weight)
-    v_alone = max(0.0, float(mid_alone.mean()))
-    changed_a, changed_b = wide_a - a, wide_b - b
-    change = 0.5 * weight * (changed_a[:, 0] * changed_b[:, 1] + changed_a[:, 1] * changed_b[:, 0])
 
-    # --- Decisions ---
-    share, paths = 1.0, light_paths or 5 * emitted
-    narrow, wide = (_NARROW, _WIDE) if choose else (1.0, 1.0)
-    widths = np.full(len(rest), narrow)
-    for _ in range(_ROUNDS):
-        photons = (
-            0.5
-            * emitted
-            * (
-                wide**2 * (shared + alone / (share * each))
-                + narrow**2 * (mid_shared + mid_alone / (share * each))
-            )
-        )
-        if choose:
-            widths = _widths(tiles, photons, change, _PASSES * paths).ravel()
-        area = float(np.mean((widths / narrow) ** 2))
-        thinner = float(np.mean((narrow / widths) ** 2)) * emitted / paths
-        gather = _GATHER * points_each + _MET * met * area * paths / emitted
+def _has_found(caustic, light, weight) -> bool:
+    """Have eye paths found the caustics of the map, by enough hits?"""
+    root = np.sqrt(weight)[:, None]
+    hits, there = (caustic * root).ravel(), float((light * root).mean())
+    squares = float((hits**2).sum())
+    enough = squares == 0 or float(hits.sum()) ** 2 >= _HITS * squares
+    return enough and float(hits.mean()) >= _FOUND * there
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """The best that can be done with a use of the map; see the module's head. error: relative MSE.
+    noise, work: of each pair."""
+
+    tiles: _Tiles
+    use: str
+    share: float
+    light_paths: float
+    widths: np.ndarray
+    counts: np.ndarray | None
+    error: float
+
+    @staticmethod
+    def of(
+        tiles: _Tiles,
+        choose: bool,
+        each: int,
+        light_paths: int | None,
+        filtered: float,
+        whole,
+        use: str,
+        weight,
+        v_own,
+        found: _Found | None = None,
+        later: Any = 0.0,
+        work: Any = None,
+    ) -> _Plan:
+        """
+        choose  widths of kernels.
+        filtered  variance of eye paths that the film leaves (``film.noise_share``).
+        whole   work of path tracing.
+        v_own   of an eye path, without what it gathers; later: what it has more because it goes on
+                beyond the first gathered part.
+        found   in the map; None: there is none.
+        work    of an eye path; None: of path tracing.
+        """
+        work = whole if work is None else work
+        v_eye = _STRATIFIED * float(v_own.mean()) + _LATER_STRATIFIED * float(np.mean(later))
+        v_eye = filtered * max(v_eye, 0.0)
+        total = _PASSES * each * tiles.pixels * float(whole.mean())
         least = max(_LEAST_SHARE, min(1.0, _GATHERS_PER_PIXEL / each))
-        v_eye = _STRATIFIED * float(v_rest.mean())
-        if v_eye > 0:
-            share = math.sqrt((v_gather + v_alone * thinner) / (v_eye * gather))
-        # In steps, so that machines whose arithmetic differs in the last digits agree.
-        share = min(16, math.ceil(16 * max(least, share))) / 16
-        if not light_paths:
-            light = _LIGHT_PATH + _LEFT * maps[0].stored / emitted
-            costs = (1 + share * gather) / (light * tiles.pixels)
-            photons = max(0.0, float((photons / widths**2).mean()))
-            eye = max(v_eye + v_gather / share, 1e-30)
-            paths = max(each * tiles.pixels * math.sqrt(photons * costs / eye), 1.0)
-    noise = v_rest + 0.5 * (_within(a, a, weight) + _within(b, b, weight)) / share
-    counts = in_proportion(tiles.spread(noise, work + share * gather), each)
-    return Survey(share, paths, counts, tiles.to_pixels(tiles.grid(widths)))
+        if found is None:
+            error = v_eye * tiles.pixels * float(work.mean()) / total
+            counts = tiles.counts(v_own + later, work, each)
+            share = 1.0 if use == "none" else least
+            return _Plan(tiles, use, share, 0.0, np.ones(1), counts, error)
+
+        # --- Variances and bias² of each pair, relative to the light there ---
+        a, b, emitted = found.a, found.b, found.emitted
+        v_gather = filtered * max(0.0, float(_within(a, b, weight).mean()))
+        shared, alone = _of_photons(found.wide_a - found.wide_b, weight)
+        mid_shared, mid_alone = _of_photons(a - b, weight)
+        alone, mid_alone = filtered * alone, filtered * mid_alone
+        v_alone = max(0.0, float(mid_alone.mean()))
+        changed_a, changed_b = found.wide_a - a, found.wide_b - b
+        change = changed_a[:, 0] * changed_b[:, 1] + changed_a[:, 1] * changed_b[:, 0]
+        change *= 0.5 * weight
+
+        # --- Decisions ---
+        share, paths = 1.0, light_paths or 5 * emitted
+        narrow, wide = (_NARROW, _WIDE) if choose else (1.0, 1.0)
+        widths = np.full(len(whole), narrow)
+        eye_work = float(work.mean())
+        light = _LIGHT_PATH + _LEFT * found.stored / emitted
+        for _ in range(_ROUNDS):
+            own = 1 / (share * each)
+            b_1 = wide**2 * (shared + own * alone) + narrow**2 * (mid_shared + own * mid_alone)
+            b_1 *= 0.5 * emitted
+            if choose:
+                widths = _widths(tiles, b_1, change, _PASSES * paths).ravel()
+            area = float(np.mean((widths / narrow) ** 2))
+            thinner = float(np.mean((narrow / widths) ** 2)) * emitted / paths
+            gather = _GATHER * found.points + _MET * found.met * area * paths / emitted
+            if v_eye > 0:
+                share = math.sqrt((v_gather + v_alone * thinner) * eye_work / (v_eye * gather))
+            # In steps, so that machines whose arithmetic differs in the last digits agree.
+            share = min(16, math.ceil(16 * max(least, share))) / 16
+            eye_noise = max(v_eye + v_gather / share, 1e-30)
+            by_photons = max(0.0, float((b_1 / widths**2).mean()))
+            if not light_paths:
+                costs = (eye_work + share * gather) / (light * tiles.pixels)
+                paths = max(each * tiles.pixels * math.sqrt(by_photons * costs / eye_noise), 1.0)
+        pass_ = each * tiles.pixels * (eye_work + share * gather) + paths * light
+        error = (eye_noise / each + by_photons / paths) * pass_ / total
+        error += _bias2(float(np.mean(change * (widths / _NARROW) ** 3))) if choose else 0.0
+        noise = v_own + later + 0.5 * (_within(a, a, weight) + _within(b, b, weight)) / share
+        counts = tiles.counts(noise, work + share * gather, each)
+        return _Plan(tiles, use, share, paths, widths, counts, error)
+
+    def survey(self, errors, map_, points) -> Survey:
+        widths = self.widths
+        if widths.size > 1:
+            widths = self.tiles.to_pixels(self.tiles.grid(widths))
+        return Survey(
+            self.use, errors, self.share, self.light_paths, self.counts, widths, map_, points
+        )
+
+
+def _bias2(change: float) -> float:
+    """From the square of what changes between kernels of 4 and 8 pixels."""
+    return max(change, 0.0) / (2**1.5 - 1) ** 2
 
 
 def _widths(tiles: _Tiles, photons, change, light_paths: float) -> np.ndarray:
@@ -187,12 +382,12 @@ def _widths(tiles: _Tiles, photons, change, light_paths: float) -> np.ndarray:
 
 def _gathered(scene, map_, radius, seed, points, colours, lanes):
     """(light of pairs, photons an eye path meets)."""
-    light, photons = dr.zeros(mi.Float, lanes), 0.0
+    light, met = dr.zeros(mi.Float, lanes), 0.0
     r = dr.opaque(mi.Float, radius)
-    for found in scene.gather(map_, r, seed, points, colours):
+    for found in scene.gather(map_, r, seed, points, colours) if map_.stored else ():
         dr.scatter_add(light, channel_mean(found.radiance), found.lane)
-        photons += float(dr.sum(mi.Float(found.photons))[0]) / lanes
-    return _pairwise(light), photons
+        met += float(dr.sum(mi.Float(found.photons))[0]) / lanes
+    return _pairwise(light), met
 
 
 def _pairwise(values) -> np.ndarray:
@@ -265,11 +460,23 @@ class _Tiles:
         floor = 0.25 * float(np.median(lit)) if lit.size else 1.0
         return (1 / (level**2 + floor**2)).ravel()
 
-    def spread(self, noise, work) -> np.ndarray:
-        """√(variance/work) of each pixel, from those of pairs."""
-        noise = _smooth(self.grid(noise))
-        noise = _TRUST * noise + (1 - _TRUST) * noise.mean()
-        return self.to_pixels(np.sqrt(noise / _smooth(self.grid(work))))
+    def counts(self, noise, work, each: int) -> np.ndarray | None:
+        """Samples of each pixel, in proportion to √(variance/work), from those of pairs; None where
+        even ones are as good: rare bright samples say little about where the next ones will be."""
+        noise, work = self.grid(noise), _smooth(self.grid(work))
+        if not noise.mean() > 0:
+            return None
+        # What every other tile says, tried on the tiles between them.
+        chess = np.indices(noise.shape).sum(0) % 2
+        gains = []
+        for known in (chess, 1 - chess):
+            share = _allotted(_smooth(noise * known) / _smooth(1.0 * known), work)
+            tried = known == 0
+            cost = (noise / share)[tried].mean() * (work * share).mean()
+            gains.append(noise[tried].mean() * work.mean() / cost)
+        if not np.mean(gains) > _WORTH:
+            return None
+        return in_proportion(self.to_pixels(_allotted(_smooth(noise), work)), each)
 
     def uncertainty(self, pairs) -> np.ndarray:
         """Half a standard error of smoothed means of pairs, in each tile."""
@@ -279,6 +486,13 @@ class _Tiles:
     def to_pixels(self, tiles) -> np.ndarray:
         pixels = np.kron(tiles, np.ones((self.edge, self.edge)))
         return pixels[: self.height, : self.width].ravel()
+
+
+def _allotted(noise, work):
+    """Samples of each tile as shares of the mean."""
+    noise = np.maximum(_TRUST * noise + (1 - _TRUST) * noise.mean(), 0)
+    share = np.sqrt(noise / work)
+    return np.clip(share / share.mean(), LEAST, MOST)
 
 
 _BINOMIAL = np.array([1, 4, 6, 4, 1]) / 16

@@ -262,7 +262,7 @@ class AnisoPhotonMapper:
             )
             self.variance = done.variance
             if done.map:
-                self._last_map = (scene, prepared, done.map, done.radius)
+                self._last_map = (scene, done.scene, done.map, done.radius)
             image = sensor.film().develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)

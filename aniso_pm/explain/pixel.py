@@ -69,6 +69,10 @@ def explain(
     each = shares(settings, spp, pixels).each
     wanted = settings.photon_count or None, settings.initial_radius or None
     settled = settle(prepared, sensor, seed, each, *wanted)
+    if settled.use == "none" and prepared.undecided:  # kernels are asked for
+        prepared = prepared.with_(map="global")
+        settled = settle(prepared, sensor, seed, each, *wanted)
+    prepared = replace(prepared, chosen=settled.use)
     count, radius0 = settled.count, settled.radius
     # Photon by photon, so that those that are shown are those that are summed.
     prepared = prepared.with_(photon_count=count, gather_tolerance=0.0)
@@ -202,7 +206,7 @@ class _Vertices:
         kinds = (mi.Bool, mi.Point3f, mi.Vector3f, mi.UInt32, mi.UInt32, mi.Float, mi.Float)
         return _Vertices(*(dr.zeros(kind, lanes * _VERTICES) for kind in kinds))
 
-    def see(self, lane, depth, si, bsdf, bs, active):
+    def see(self, lane, depth, si, bsdf, bs, active, scattered):
         """Write down a vertex; called while eye paths are traced."""
         slot, active = lane * _VERTICES + depth - 1, active & (depth <= _VERTICES)
         alpha = read_roughness(bsdf, si, active)

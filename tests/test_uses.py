@@ -1,0 +1,194 @@
+"""``map=auto``: the pilot chooses the use of the map of least error, and never one that loses light."""
+
+from dataclasses import replace
+
+import aniso_pm  # noqa: F401
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from aniso_pm import pilot, survey
+from aniso_pm.prepared import prepare
+from aniso_pm.settings import Settings
+from rooms import room_with_ball
+
+
+def ball(light, bsdf, size=24):
+    """A ball over a large plate."""
+    T = mi.ScalarTransform4f
+    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+    return {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective",
+            "fov": 40,
+            "to_world": T().look_at(origin=[0, 2, 5], target=[0, 0.3, 0], up=[0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+        },
+        "light": light,
+        "plate": {
+            "type": "rectangle",
+            "to_world": T().rotate([1, 0, 0], -90).scale(3),
+            "bsdf": diffuse,
+        },
+        "ball": {"type": "sphere", "center": [0, 0.6, 0], "radius": 0.6, "bsdf": bsdf},
+    }
+
+
+SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 1}}
+POINT = {
+    "type": "point",
+    "position": [2, 4, 1],
+    "intensity": {"type": "rgb", "value": 30},
+}
+PLASTIC = {"type": "roughplastic", "alpha": 0.1}
+GLASS = {"type": "dielectric"}
+
+
+def settled(definition, **settings):
+    scene = mi.load_dict(definition)
+    prepared = prepare(scene, Settings(**settings), False)
+    return pilot.settle(prepared, scene.sensors()[0], 0, 16), prepared
+
+
+def test_what_path_tracing_does_well_is_path_traced(variant_llvm_rgb):
+    found, prepared = settled(ball(SKY, PLASTIC, 64))
+    assert prepared.undecided
+    assert found.use == "none"
+    assert found.errors["none"] < found.errors["global"]
+
+
+@pytest.mark.parametrize("bsdf", [PLASTIC, GLASS], ids=["plastic", "glass"])
+def test_light_that_only_photons_find_has_a_map(variant_llvm_rgb, bsdf):
+    """A point cannot be hit: what it sends over a mirror is lost to eye paths."""
+    found, _ = settled(ball(POINT, bsdf))
+    assert found.use in ("global", "caustic")
+    assert "none" not in found.errors
+
+
+def test_caustics_that_eye_paths_rarely_find_have_a_map(variant_llvm_rgb):
+    lamp = {
+        "type": "sphere",
+        "center": [1, 4, 1],
+        "radius": 0.03,
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 2000}},
+    }
+    found, _ = settled(ball(lamp, GLASS))
+    assert found.use in ("global", "caustic")
+    assert found.errors.get("none") is None
+
+
+def test_a_use_that_is_given_is_kept(variant_llvm_rgb):
+    for use in ("global", "caustic"):
+        found, prepared = settled(ball(SKY, PLASTIC), map=use)
+        assert found.use == use and not found.errors and not prepared.undecided
+    found, prepared = settled(ball(SKY, PLASTIC), final_gather=True)
+    assert found.use == "final_gather" and not prepared.undecided
+
+
+SCENES = {
+    "plastic": lambda: ball(SKY, PLASTIC),
+    "glass": lambda: ball(SKY, GLASS),
+    "room": lambda: room_with_ball(size=24),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_what_uses_leave_to_eye_paths_is_told_apart(variant_llvm_rgb, scene):
+    """The parts add up to what eye paths of each use see, and all of them to path's picture."""
+    scene = mi.load_dict(SCENES[scene]())
+    sensor, spp = scene.sensors()[0], 4096
+    prepared = prepare(scene, Settings(), False)
+    width, height = sensor.film().crop_size()
+    lanes = width * height * spp
+
+    def rays(seed):
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, lanes)
+        pixel = dr.arange(mi.UInt32, lanes) // spp
+        place = mi.Point2f(pixel % width, pixel // width) + sampler.next_2d()
+        ray, _ = sensor.sample_ray(0, 0.5, place / mi.Point2f(width, height), mi.Point2f(0.5))
+        return sampler, ray
+
+    def mean_and_error(values):
+        values = values.numpy().astype(np.float64)
+        return values.mean(), values.std() / lanes**0.5
+
+    def seen(use, seed):
+        return replace(prepared, chosen=use).trace(*rays(seed))[0]
+
+    parts = seen("survey", 1)
+    total = dr.sum(parts.radiance) / 3
+    for seed, use, value in (
+        (2, "global", total - parts.later),
+        (3, "caustic", total),
+        (4, "none", total + parts.caustic),
+    ):
+        a, error_a = mean_and_error(value)
+        b, error_b = mean_and_error(dr.sum(seen(use, seed)) / 3)
+        error = np.hypot(error_a, error_b)
+        assert error < 0.01 * b
+        assert abs(a - b) < 4 * error, use
+    image = mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=spp)
+    assert abs(float(np.mean(image)) - b) < 4 * 1.5 * error_b
+
+
+@pytest.mark.parametrize("chosen", ["global", "caustic", "none"])
+def test_every_choice_gives_the_picture_of_path(variant_llvm_rgb, monkeypatch, chosen):
+    from aniso_pm import progressive
+
+    scene = mi.load_dict(ball(SKY, PLASTIC))
+
+    def settle(prepared, *args, **more):
+        assert prepared.undecided
+        return pilot.settle(replace(prepared, chosen=chosen), *args, **more)
+
+    monkeypatch.setattr(progressive, "settle", settle)
+    plugin = mi.load_dict({"type": "aniso_pm", "initial_radius": 0.03, "photon_count": 300_000})
+    ours = [np.mean(mi.render(scene, integrator=plugin, spp=256, seed=s)) for s in range(4)]
+    assert plugin.statistics["map"] == chosen
+    path = mi.load_dict({"type": "path"})
+    theirs = [np.mean(mi.render(scene, integrator=path, spp=1024, seed=s)) for s in range(4)]
+    error = np.hypot(np.std(ours), np.std(theirs)) / np.mean(theirs) / 3**0.5
+    assert error < 0.003
+    assert abs(np.mean(ours) / np.mean(theirs) - 1) < 0.005 + 3 * error
+
+
+def test_after_path_tracing_sample_path_traces(variant_llvm_rgb):
+    """``aov`` samples with what render() has left: no map of another use."""
+    scene = mi.load_dict(ball(SKY, PLASTIC, 64))
+    plugin = mi.load_dict({"type": "aniso_pm"})
+    image = mi.render(scene, integrator=plugin, spp=64)
+    assert plugin.statistics["map"] == "none"
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 1 << 18)
+    sensor = scene.sensors()[0]
+    ray, _ = sensor.sample_ray(0, 0.5, sampler.next_2d(), mi.Point2f(0.5))
+    L, _, _ = plugin.sample(scene, sampler, ray)
+    found = float(np.mean(dr.sum(L).numpy() / 3))
+    assert found == pytest.approx(float(np.mean(image)), rel=0.01)
+
+
+def test_noise_of_a_film_filter(variant_llvm_rgb):
+    """∫f²/(∫f)²: 1 for a box; 4/9 for a tent; 1/(4πσ²) for a Gaussian that is not cut."""
+    from aniso_pm.film import noise_share
+
+    def share(**rfilter):
+        return noise_share(mi.load_dict({"type": "hdrfilm", "rfilter": rfilter}))
+
+    assert share(type="box") == pytest.approx(1)
+    assert share(type="tent") == pytest.approx(4 / 9, rel=1e-3)
+    assert share(type="gaussian", stddev=0.4) == pytest.approx(1 / (4 * np.pi * 0.16), rel=0.01)
+
+
+def test_uneven_samples_only_where_they_were_tried(variant_llvm_rgb):
+    """Noise that is in one half of the picture is followed; single bright pairs are not."""
+    tiles = survey._Tiles(1, 64, 64)
+    random = np.random.default_rng(3)
+    half = np.where(np.arange(64 * 64) % 64 < 32, 20.0, 1.0) * random.chisquare(8, 64 * 64)
+    work = np.ones(64 * 64)
+    counts = tiles.counts(half, work, 16).reshape(64, 64)
+    assert counts[:, :28].mean() > 2 * counts[:, 36:].mean()
+    assert counts.mean() == 16
+    rare = (random.random(64 * 64) < 0.01) * 100.0 + 0.1
+    assert tiles.counts(rare, work, 16) is None
