@@ -269,7 +269,10 @@ def _walk(scene, sampler, ray, options, push, see):
     # What the survey tells apart: found beyond a gathered part; over walked parts beyond one, and
     # the throughput of emission there; had the path left a gathered part before its last vertex?
     survey = o.use == "survey"
-    later = caustic = β_caustic = before = None
+    later: Any = None
+    caustic: Any = None
+    β_caustic: Any = None
+    before: Any = None
     if dr.hint(survey, mode="scalar"):
         later, caustic = mi.Float(0), mi.Float(0)
         β_caustic, before = mi.Spectrum(0), mi.Bool(False)

@@ -12,8 +12,8 @@ that errors are relative,
     V_p = ⟨(g_aA − g_aB)(g_bA − g_bB)⟩/2       of photons that a pixel's samples share.
 
 A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot)
-has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths being
-what the film's filter leaves of it), and costs
+has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths
+being what the film's filter leaves of it), and costs
 n P (C + q C_g) + N C_p, P the number of pixels. For given n, variance times cost is smallest at
 
     q² = C (V_g + V_gp)/(V_r C_g),        N² = n² P (C + q C_g) B / (A C_p),
@@ -36,9 +36,9 @@ path tracing and tell apart what each use leaves to them (see ``eye.Parts``). Th
 
     bias² + (A/n + B/N) (n P (C + q C_g) + N C_p) / (M n P C_0)
 
-is chosen, its error after the work of M passes of path tracing, C_0 for each path. Path tracing finds some caustics by
-rare hits that a pilot may miss, so that their variance seems small; it is chosen only where it has
-found the caustics that the map holds, by many hits.
+is chosen, its error after the work of M passes of path tracing, C_0 for each path. Path tracing
+finds some caustics by rare hits that a pilot may miss, so that their variance seems small; it is
+chosen only where it has found the caustics that the map holds, by many hits.
 """
 
 from __future__ import annotations
@@ -326,7 +326,7 @@ class _Plan:
         change *= 0.5 * weight
 
         # --- Decisions ---
-        share, paths = 1.0, light_paths or 5 * emitted
+        share, paths = 1.0, float(light_paths or 5 * emitted)
         narrow, wide = (_NARROW, _WIDE) if choose else (1.0, 1.0)
         widths = np.full(len(whole), narrow)
         eye_work = float(work.mean())

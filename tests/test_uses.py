@@ -1,4 +1,4 @@
-"""``map=auto``: the pilot chooses the use of the map of least error, and never one that loses light."""
+"""``map=auto``: the pilot chooses the use of least error, and never one that loses light."""
 
 from dataclasses import replace
 
