@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from .film import pixel_count
 from .history import recorded
 from .needs import emitter_name
-from .pilot import camera_rays
+from .pilot import camera_rays, settle
 from .prepared import Prepared
+from .schedule import shares
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,9 @@ class Finding:
 
 
 def examine(scene: Prepared) -> list[Finding]:
-    """All decisions that were taken for a scene and its integrator's parameters."""
+    """All decisions that were taken for a scene and its integrator's parameters. Where the use of
+    the map is open a pilot is traced through the scene's first sensor, as before a rendering."""
+    scene, why_map = decided(scene)
     needs, settings = scene.needs, scene.settings
     shown = scene.follow_lobes
     why_disc = "parameter kernel=isotropic" if settings.kernel == "isotropic" else "none found"
@@ -39,7 +43,7 @@ def examine(scene: Prepared) -> list[Finding]:
             f"{scene.use}: photons are traced and gathered"
             if scene.needs_map
             else "no photon is traced: the scene is path traced",
-            _why_map(scene) + (needs.receivers or ["no surface gathers"]),
+            why_map + (needs.receivers or ["no surface gathers"]),
         ),
         Finding(
             "caustics, specular chains",
@@ -138,6 +142,7 @@ def _environment(scene: Prepared) -> Finding:
 
 def kernels(scene: Prepared) -> Finding:
     """What is compiled for each stage, found by a tiny pass with the scene's first sensor."""
+    scene, _ = decided(scene)
     radius = dr.opaque(mi.Float, scene.settings.initial_radius or 0.01 * scene.extent)
     rays = camera_rays(scene.scene.sensors()[0], 0)
     sampler = mi.load_dict({"type": "independent"})
@@ -161,13 +166,30 @@ def kernels(scene: Prepared) -> Finding:
     return Finding("kernels", True, f"{number} kernels, {operations:,} operations", evidence)
 
 
-def _why_map(scene: Prepared) -> list[str]:
-    """What ``map=auto`` went by."""
-    if scene.settings.map != "auto":
-        return []
-    needs = scene.needs
-    cause = [f"light over {e}" for e in needs.chains] + [f"light of {e}" for e in needs.unseen]
-    return [f"map=auto: {cause[0] if cause else 'nothing casts caustics'}"]
+def decided(scene: Prepared) -> tuple[Prepared, list[str]]:
+    """The scene with the use of its map, and what ``map=auto`` went by."""
+    needs, settings = scene.needs, scene.settings
+    if settings.map != "auto":
+        return scene, []
+    if not scene.undecided:
+        causes = [f"light of {e}" for e in needs.unseen] or ["nothing casts caustics"]
+        return scene, [f"map=auto: {causes[0]}"]
+    sensor = scene.scene.sensors()[0]
+    spp, pixels = sensor.sampler().sample_count(), pixel_count(sensor.film())
+    given = settings.photon_count or None, settings.initial_radius or None
+    found = settle(scene, sensor, 0, shares(settings, spp, pixels).each, *given)
+    return replace(scene, chosen=found.use), [f"map=auto: {as_promises(found.errors)}"]
+
+
+def as_promises(errors: dict[str, float | None]) -> str:
+    """What a pilot promises of each use of the map, in words."""
+    if not errors:
+        return "a pilot found no photon to gather"
+    words = [
+        f"{use} {'finds too little of the caustics' if error is None else f'{error:.1e}'}"
+        for use, error in errors.items()
+    ]
+    return f"relative MSE that a pilot promises: {', '.join(words)}"
 
 
 def as_text(findings: list[Finding]) -> str:

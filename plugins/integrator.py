@@ -63,9 +63,12 @@ class AnisoPhotonMapper:
        - ``global``: all indirect light is read from the photon map at the first receiver.
          ``caustic``: the map holds only light that reached a receiver over glass, mirrors and
          glossy surfaces; the rest is path traced, and scenes without caustics have no map.
-         ``auto``: ``global`` if the scene has surfaces that light is traced over (glass, mirrors,
-         smooth or coated metal) or lights that only photons find; else no map and no photons, as
-         ``caustic`` does there. ``statistics["map"]`` tells which it was, or "none".
+         ``auto``: a pilot finds out which of the two, or path tracing without any photon, has
+         the least error for the time in this scene; path tracing only if it finds all of the light
+         that the photons bring. Scenes without surfaces that light is traced over (glass, mirrors,
+         smooth or coated metal) are path traced, those with lights that only photons find take
+         ``global``. ``statistics["map"]`` tells which it was, or "none", and
+         ``statistics["map_errors"]`` the relative mean squared errors that the pilot promised.
          (Default: ``auto``)
 
      * - final_gather
