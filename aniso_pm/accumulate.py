@@ -21,6 +21,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arrays import own
+
 
 @dataclass(frozen=True)
 class Sums:
@@ -69,7 +71,8 @@ class Sums:
         """Inverse of :meth:`arrays`."""
         height, width, channels = map(int, arrays["first"].shape)
         shape = height, width, channels
-        return Sums(shape, *(mi.Float64(arrays[k].ravel()) for k in ("first", "square", "cross")))
+        names = ("first", "square", "cross")
+        return Sums(shape, *(own(mi.Float64, arrays[name].astype(float)) for name in names))
 
 
 def mean_and_variance(arrays: dict[str, np.ndarray], passes: int) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arrays import own
+
 # Samples of a pixel as multiples of the mean: the fewest and the most.
 LEAST, MOST = 0.25, 4.0
 
@@ -96,19 +98,14 @@ class Allotment:
             place = np.arange(len(pixel), dtype=np.uint32)
             place -= np.repeat((np.cumsum(counts) - counts).astype(np.uint32), counts)
             weight = np.repeat(((self.each + more) / n).astype(np.float32), counts)
-            self._kept[key] = tuple(map(_own, (pixel, place, weight)))
+            self._kept[key] = (
+                own(mi.UInt32, pixel),
+                own(mi.UInt32, place),
+                own(mi.Float, weight),
+            )
         pixel, place, weight = self._kept[key]
-        sample = dr.gather(mi.UInt32, mi.UInt32(start.astype(np.uint32)), pixel) + place
+        sample = dr.gather(mi.UInt32, own(mi.UInt32, start.astype(np.uint32)), pixel) + place
         return Lanes(pixel + dr.opaque(mi.UInt32, first), sample, weight, dr.width(pixel))
-
-
-def _own(values: np.ndarray):
-    """A Dr.Jit array in memory of its own: NumPy's is used as it lies, and kernels that read from
-    places that are not aligned are others, which would be compiled beside those that are."""
-    kind = mi.UInt32 if values.dtype == np.uint32 else mi.Float
-    array = kind(values) + dr.opaque(kind, 0)
-    dr.eval(array)
-    return array
 
 
 def in_proportion(noise: np.ndarray, each: int) -> np.ndarray | None:

@@ -34,6 +34,7 @@ import mitsuba as mi
 import numpy as np
 
 from .amends import Amends, amends
+from .arrays import own
 from .emitters import refuse, refuse_scale
 from .ndf import children
 from .spectra import channel_mean
@@ -218,7 +219,7 @@ def prepare(scene) -> Emission:
     power = dr.block_sum(flux, _PILOT_RAYS).numpy().astype(np.float64) * weight
     share = power / power.sum() if power.sum() > 0 else seen / seen.sum()
     chances = (1 - _FLOOR) * share + _FLOOR * seen / seen.sum()
-    choose = mi.DiscreteDistribution(mi.Float(chances.astype(np.float32)))
+    choose = mi.DiscreteDistribution(own(mi.Float, chances.astype(np.float32)))
     return replace(even, choose=choose)
 
 

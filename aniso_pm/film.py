@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arrays import own
+
 # Points at which a reconstruction filter is looked at.
 _STEPS = 1000
 
@@ -110,7 +112,7 @@ def show(film, image):
 
 def show_array(film, array):
     """As :func:`show`, from a NumPy array."""
-    show(film, mi.TensorXf(array.astype("float32")))
+    show(film, mi.TensorXf(own(mi.Float, array.astype(np.float32)), array.shape))
 
 
 def describe(film) -> dict[str, Any]:

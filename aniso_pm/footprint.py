@@ -18,6 +18,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+from .arrays import own
 
 # Kernels of the first passes may be narrower than the bandwidth by so much.
 _LEAST = 4
@@ -75,7 +78,8 @@ def of(sensor, radius: float, widths=1.0) -> Footprint:
         start = dr.maximum(start, dr.norm(beside.o - ray.o))
         spread = dr.maximum(spread, dr.norm(beside.d - ray.d))
     unit = dr.rcp(dr.opaque(mi.Float, radius))
-    found = Footprint(start * unit, spread * unit, mi.Float(1), mi.Float(widths))
+    width = own(mi.Float, np.array(widths, np.float32))
+    found = Footprint(start * unit, spread * unit, mi.Float(1), width)
     dr.make_opaque(found.start, found.spread, found.least, found.widths)
     return found
 

@@ -1,0 +1,25 @@
+"""NumPy arrays into Dr.Jit's memory."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+
+# A multiple of what any machine reads at once.
+_LANES = 64
+
+
+def own(kind, values: np.ndarray):
+    """``values``, flattened, as a Dr.Jit array (``mi.Float``, ``mi.UInt32``) in its own memory.
+
+    ``kind(values)`` uses NumPy's memory as it lies. The LLVM backend (Dr.Jit 1.5) reads whole
+    vectors from it, up to 60 bytes beyond its end, which ends the process where the next page is not
+    mapped; and where memory is not aligned its kernels are others, compiled beside those for
+    memory that is.
+    """
+    count = values.size
+    padded = np.zeros(-(-max(count, 1) // _LANES) * _LANES, values.dtype)
+    padded[:count] = values.ravel()
+    array = kind(padded) + dr.opaque(kind, 0)
+    dr.eval(array)
+    return dr.reshape(kind, array, count, shrink=True)
