@@ -13,8 +13,8 @@ def own(kind, values: np.ndarray):
     """``values``, flattened, as a Dr.Jit array (``mi.Float``, ``mi.UInt32``) in its own memory.
 
     ``kind(values)`` uses NumPy's memory as it lies. The LLVM backend (Dr.Jit 1.5) reads whole
-    vectors from it, up to 60 bytes beyond its end, which ends the process where the next page is not
-    mapped; and where memory is not aligned its kernels are others, compiled beside those for
+    vectors from it, up to 60 bytes beyond its end, which ends the process where the next page is
+    not mapped; and where memory is not aligned its kernels are others, compiled beside those for
     memory that is.
     """
     count = values.size

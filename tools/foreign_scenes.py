@@ -103,6 +103,9 @@ def measure(file, options):
         try:
             images = renders(scene, {"type": "aniso_pm"} | more, options.ours, 2000 + 100 * number)
         except (ValueError, RuntimeError) as problem:
+            # mi.render() hides what was raised inside of it.
+            while problem.__cause__ is not None:
+                problem = problem.__cause__
             row["refused"].append(str(problem))
             continue
         own = np.array([image.mean() for image in images])
