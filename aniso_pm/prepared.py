@@ -116,11 +116,14 @@ class Prepared:
         return "global" if self.settings.map == "auto" else self.settings.map
 
     @property
-    def path_tracing_suffices(self) -> bool:
-        """Can eye paths find all light by themselves? Not if a point emits it, or a direction has
-        all of it: whatever such a light sends over a mirror is only found by photons."""
+    def photons_are_dispensable(self) -> bool:
+        """May a pilot choose path tracing? Not where eye paths cannot find all light by themselves
+        (a point emits it, or a direction has all of it: what such a light sends over a mirror is
+        found by photons only), and not where somebody says how many photons, or how large kernels
+        are to be."""
         delta = mi.EmitterFlags.Delta
-        return not any(mi.has_flag(e.flags(), delta) for e in self.scene.emitters())
+        asked = self.settings.photon_count or self.settings.initial_radius
+        return not asked and not any(mi.has_flag(e.flags(), delta) for e in self.scene.emitters())
 
     @property
     def crowding(self) -> int:

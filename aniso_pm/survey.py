@@ -53,13 +53,11 @@ import mitsuba as mi
 import numpy as np
 
 from . import eye, footprint, photons
-from .allotment import LEAST, MOST, in_proportion
-from .film import noise_share, rays_through, sampled_size, wavelengths
+from .film import noise_share, rays_through, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 from .spectra import channel_mean
+from .tiles import SAMPLES, Tiles, smooth
 
-# Tiles of the picture at most, and stratified samples of each half of the pair in a tile's pixel.
-_TILES, _SAMPLES = 4096, 4
 # Widths of kernels that are compared, and the range of those that are chosen, in pixels.
 _NARROW, _WIDE = 4.0, 8.0
 _THINNEST, _WIDEST = 1.0, 32.0
@@ -71,17 +69,11 @@ _LEAST_SHARE, _GATHERS_PER_PIXEL = 1 / 8, 2
 _CAMERA, _VERTEX = 0.3, 0.4
 # Work of a gather, each photon it meets, a light path, a photon it leaves; an eye path is about 1.
 _GATHER, _MET, _LIGHT_PATH, _LEFT = 1.2, 1 / 40, 0.6, 0.4
-# Variance of an eye sample among a few hundred stratified ones, as a share of that among _SAMPLES:
+# Variance of an eye sample among a few hundred stratified ones, as a share of that among SAMPLES:
 # 0.59 among 52 and falling, in direct light.
 _STRATIFIED = 0.45
-# A tile's numbers count by so much, the rest is the picture's mean.
-_TRUST = 0.85
-# Uneven samples have to promise so much less work for the same error: they are a tenth slower.
-_WORTH = 1.15
 # Rounds in which the decisions, each of which depends on the others, settle.
 _ROUNDS = 4
-
-
 # Variance beyond the first gathered part, where stratification does less, as such a share.
 _LATER_STRATIFIED = 0.85
 # Another use of the map than "global" has to promise an error smaller by so much.
@@ -125,7 +117,7 @@ def look(
     maps         two independent photon maps of as many light paths, or empty ones.
     light_paths  of a pass if they are given, else 0 or None.
     """
-    tiles = _Tiles.of(sensor)
+    tiles = Tiles.of(sensor)
     seen = _trace(scene, sensor, tiles, seed)
     read = partial(_read, scene, sensor, radius, seed, tiles.lanes)
     filtered = noise_share(sensor.film())
@@ -133,7 +125,7 @@ def look(
     if seen.points is None or not min(map_.stored for map_ in maps):
         use = scene.use
         if use == "survey":
-            use = "none" if scene.path_tracing_suffices else "caustic"
+            use = "none" if scene.photons_are_dispensable else "caustic"
         light = seen.own + seen.later + (0 if use == "caustic" else seen.caustic)
         weight = tiles.weight(light)
         return decide(use, weight, _within(light, light, weight)).survey({}, None, None)
@@ -165,7 +157,7 @@ def look(
         errors["caustic"] = plan.error
         if plan.error < limit:
             best, chosen, limit = plan, (maps[0], any_), plan.error
-        if scene.path_tracing_suffices:
+        if scene.photons_are_dispensable:
             errors["none"] = None
             if _has_found(seen.caustic, found.light, weight):
                 light = light + seen.caustic
@@ -196,10 +188,10 @@ class _Seen:
     points: Any
 
 
-def _trace(scene: Prepared, sensor, tiles: _Tiles, seed: int) -> _Seen:
+def _trace(scene: Prepared, sensor, tiles: Tiles, seed: int) -> _Seen:
     sampler = mi.load_dict({"type": "owen_sobol"})
     lane = dr.arange(mi.UInt32, tiles.lanes)
-    sampler.begin(stream_seed(seed, PILOT, 3), lane // _SAMPLES, lane % _SAMPLES)
+    sampler.begin(stream_seed(seed, PILOT, 3), lane // SAMPLES, lane % SAMPLES)
     ray, _ = rays_through(sensor, sampler, tiles.positions(sensor, seed, sampler), 0.5)
     scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
     vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
@@ -271,7 +263,7 @@ class _Plan:
     """The best that can be done with a use of the map; see the module's head. error: relative MSE.
     noise, work: of each pair."""
 
-    tiles: _Tiles
+    tiles: Tiles
     use: str
     share: float
     light_paths: float
@@ -281,7 +273,7 @@ class _Plan:
 
     @staticmethod
     def of(
-        tiles: _Tiles,
+        tiles: Tiles,
         choose: bool,
         each: int,
         light_paths: int | None,
@@ -370,12 +362,12 @@ def _bias2(change: float) -> float:
     return max(change, 0.0) / (2**1.5 - 1) ** 2
 
 
-def _widths(tiles: _Tiles, photons, change, light_paths: float) -> np.ndarray:
+def _widths(tiles: Tiles, photons, change, light_paths: float) -> np.ndarray:
     """Of kernels in each tile, in pixels (see the module's head). photons: B₁ of each pair."""
-    photons = _smooth(tiles.grid(photons))
+    photons = smooth(tiles.grid(photons))
     photons = np.maximum(photons, 1e-3 * max(float(photons.mean()), 1e-30))
     error = tiles.uncertainty(change)
-    bias2 = (2**1.5 - 1) ** -2 * (np.maximum(_smooth(tiles.grid(change)), 0) + error)
+    bias2 = (2**1.5 - 1) ** -2 * (np.maximum(smooth(tiles.grid(change)), 0) + error)
     fifth = 2 * photons * _NARROW**3 / (3 * light_paths * np.maximum(bias2, 1e-30))
     return np.clip(fifth**0.2, _THINNEST, _WIDEST)
 
@@ -391,119 +383,18 @@ def _gathered(scene, map_, radius, seed, points, colours, lanes):
 
 
 def _pairwise(values) -> np.ndarray:
-    """Means over _SAMPLES lanes, (pairs, 2), finite, double precision."""
+    """Means over SAMPLES lanes, (pairs, 2), finite, double precision."""
     values = np.nan_to_num(values.numpy().astype(np.float64), posinf=0, neginf=0)
-    return values.reshape(-1, 2, _SAMPLES).mean(-1)
+    return values.reshape(-1, 2, SAMPLES).mean(-1)
 
 
 def _within(v, w, weight):
     """Of a single sample: half the product of differences within each pair."""
-    return 0.5 * _SAMPLES * weight * (v[:, 0] - v[:, 1]) * (w[:, 0] - w[:, 1])
+    return 0.5 * SAMPLES * weight * (v[:, 0] - v[:, 1]) * (w[:, 0] - w[:, 1])
 
 
 def _of_photons(difference, weight):
     """Variance by photons, of what all samples of a pixel share and of what each has alone.
     difference: between the two maps."""
     shared = 0.5 * weight * difference[:, 0] * difference[:, 1]
-    return shared, _SAMPLES * (0.25 * weight * (difference**2).sum(1) - shared)
-
-
-@dataclass(frozen=True)
-class _Tiles:
-    """Squares of ``edge`` pixels that cover a film, with a random pixel and its pair in each."""
-
-    edge: int
-    width: int
-    height: int
-
-    @staticmethod
-    def of(sensor) -> _Tiles:
-        width, height = sampled_size(sensor.film())
-        return _Tiles(max(1, math.ceil(math.sqrt(width * height / _TILES))), width, height)
-
-    @property
-    def across(self) -> int:
-        return -(-self.width // self.edge)
-
-    @property
-    def down(self) -> int:
-        return -(-self.height // self.edge)
-
-    @property
-    def lanes(self) -> int:
-        return 2 * _SAMPLES * self.across * self.down
-
-    @property
-    def pixels(self) -> int:
-        return self.width * self.height
-
-    def positions(self, sensor, seed: int, sampler):
-        """On the film, of all lanes, tiles row by row."""
-        film = sensor.film()
-        tile = dr.arange(mi.UInt32, self.lanes) // (2 * _SAMPLES)
-        a, b = mi.sample_tea_32(tile, dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 4)))
-        x = dr.minimum((tile % self.across) * self.edge + a % self.edge, self.width - 1)
-        y = dr.minimum((tile // self.across) * self.edge + b % self.edge, self.height - 1)
-        border = (self.width - film.crop_size().x) // 2
-        corner = film.crop_offset()
-        corner = mi.ScalarPoint2f(corner.x - border, corner.y - border)
-        return mi.Point2f(mi.Float(x), mi.Float(y)) + corner + sampler.next_2d()
-
-    def grid(self, pairs) -> np.ndarray:
-        """Values of pairs as (down, across)."""
-        return pairs.reshape(self.down, self.across)
-
-    def weight(self, light) -> np.ndarray:
-        """1/(mean² + floor²) of each pair, the floor a quarter of the median."""
-        level = _smooth(self.grid(light.mean(1)))
-        lit = level[level > 0]
-        floor = 0.25 * float(np.median(lit)) if lit.size else 1.0
-        return (1 / (level**2 + floor**2)).ravel()
-
-    def counts(self, noise, work, each: int) -> np.ndarray | None:
-        """Samples of each pixel, in proportion to √(variance/work), from those of pairs; None where
-        even ones are as good: rare bright samples say little about where the next ones will be."""
-        noise, work = self.grid(noise), _smooth(self.grid(work))
-        if not noise.mean() > 0:
-            return None
-        # What every other tile says, tried on the tiles between them.
-        chess = np.indices(noise.shape).sum(0) % 2
-        gains = []
-        for known in (chess, 1 - chess):
-            share = _allotted(_smooth(noise * known) / _smooth(1.0 * known), work)
-            tried = known == 0
-            cost = (noise / share)[tried].mean() * (work * share).mean()
-            gains.append(noise[tried].mean() * work.mean() / cost)
-        if not np.mean(gains) > _WORTH:
-            return None
-        return in_proportion(self.to_pixels(_allotted(_smooth(noise), work)), each)
-
-    def uncertainty(self, pairs) -> np.ndarray:
-        """Half a standard error of smoothed means of pairs, in each tile."""
-        squared = _smooth(self.grid(pairs**2))
-        return 0.5 * np.sqrt(squared * _SQUARED_WEIGHTS)
-
-    def to_pixels(self, tiles) -> np.ndarray:
-        pixels = np.kron(tiles, np.ones((self.edge, self.edge)))
-        return pixels[: self.height, : self.width].ravel()
-
-
-def _allotted(noise, work):
-    """Samples of each tile as shares of the mean."""
-    noise = np.maximum(_TRUST * noise + (1 - _TRUST) * noise.mean(), 0)
-    share = np.sqrt(noise / work)
-    return np.clip(share / share.mean(), LEAST, MOST)
-
-
-_BINOMIAL = np.array([1, 4, 6, 4, 1]) / 16
-# Σ w² of the weights of ``_smooth``.
-_SQUARED_WEIGHTS = float((_BINOMIAL**2).sum() ** 2)
-
-
-def _smooth(tiles: np.ndarray) -> np.ndarray:
-    """Binomial averages over 5 × 5 tiles."""
-    for axis in (0, 1):
-        pad = [(2, 2) if k == axis else (0, 0) for k in (0, 1)]
-        windows = np.lib.stride_tricks.sliding_window_view(np.pad(tiles, pad, "edge"), 5, axis)
-        tiles = windows @ _BINOMIAL
-    return tiles
+    return shared, SAMPLES * (0.25 * weight * (difference**2).sum(1) - shared)

@@ -65,10 +65,11 @@ class AnisoPhotonMapper:
          glossy surfaces; the rest is path traced, and scenes without caustics have no map.
          ``auto``: a pilot finds out which of the two, or path tracing without any photon, has
          the least error for the time in this scene; path tracing only if it finds all of the light
-         that the photons bring. Scenes without surfaces that light is traced over (glass, mirrors,
-         smooth or coated metal) are path traced, those with lights that only photons find take
-         ``global``. ``statistics["map"]`` tells which it was, or "none", and
-         ``statistics["map_errors"]`` the relative mean squared errors that the pilot promised.
+         that the photons bring, and neither ``photon_count`` nor ``initial_radius`` is given.
+         Scenes without surfaces that light is traced over (glass, mirrors, smooth or coated metal)
+         are path traced, those with lights that only photons find take ``global``.
+         ``statistics["map"]`` tells which it was, or "none", and ``statistics["map_errors"]`` the
+         relative mean squared errors that the pilot promised.
          (Default: ``auto``)
 
      * - final_gather

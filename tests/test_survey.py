@@ -6,6 +6,7 @@ import pytest
 from aniso_pm import pilot, survey
 from aniso_pm.prepared import prepare
 from aniso_pm.settings import Settings
+from aniso_pm.tiles import SAMPLES, Tiles
 from rooms import room, room_with_ball
 
 
@@ -44,7 +45,7 @@ def test_more_samples_ask_for_more_light_paths(variant_llvm_rgb):
 def test_kernels_are_wide_where_light_is_smooth_and_narrow_at_an_edge():
     """The rule itself, with photons of equal noise everywhere and light that changes on the right
     half only."""
-    tiles = survey._Tiles(2, 64, 48)
+    tiles = Tiles(2, 64, 48)
     count = tiles.across * tiles.down
     change = np.zeros((tiles.down, tiles.across))
     change[:, 20:] = 0.04
@@ -60,7 +61,7 @@ def test_kernels_are_wide_where_light_is_smooth_and_narrow_at_an_edge():
 
 @pytest.mark.parametrize("edge", [1, 3])
 def test_tiles_cover_every_pixel_once(edge):
-    tiles = survey._Tiles(edge, 10, 7)
+    tiles = Tiles(edge, 10, 7)
     numbers = np.arange(tiles.across * tiles.down).reshape(tiles.down, tiles.across)
     pixels = tiles.to_pixels(numbers).reshape(7, 10)
     for y in range(7):
@@ -71,7 +72,7 @@ def test_tiles_cover_every_pixel_once(edge):
 def test_variances_are_those_of_the_samples(variant_llvm_rgb):
     """V_r, V_g, V_gp and V_p of numbers that are made to have them."""
     random = np.random.default_rng(1)
-    count, k = 200_000, survey._SAMPLES
+    count, k = 200_000, SAMPLES
     gather = random.normal(0, np.sqrt(0.3 / k), (count, 2))  # of each mean, whatever the map
     shared = random.normal(0, np.sqrt(0.2), (2, count, 1))  # of each map
     alone = random.normal(0, np.sqrt(0.5 / k), (2, count, 2))

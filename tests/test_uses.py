@@ -7,9 +7,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import pilot, survey
+from aniso_pm import pilot
 from aniso_pm.prepared import prepare
 from aniso_pm.settings import Settings
+from aniso_pm.tiles import Tiles
 from rooms import room_with_ball
 
 
@@ -183,7 +184,7 @@ def test_noise_of_a_film_filter(variant_llvm_rgb):
 
 def test_uneven_samples_only_where_they_were_tried(variant_llvm_rgb):
     """Noise that is in one half of the picture is followed; single bright pairs are not."""
-    tiles = survey._Tiles(1, 64, 64)
+    tiles = Tiles(1, 64, 64)
     random = np.random.default_rng(3)
     half = np.where(np.arange(64 * 64) % 64 < 32, 20.0, 1.0) * random.chisquare(8, 64 * 64)
     work = np.ones(64 * 64)
