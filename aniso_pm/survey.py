@@ -13,7 +13,7 @@ that errors are relative,
 
 A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot)
 has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths
-being what the film's filter leaves of it), and costs
+being what the film's filter leaves of it, that of shared photons the root of it), and costs
 n P (C + q C_g) + N C_p, P the number of pixels. For given n, variance times cost is smallest at
 
     q² = C (V_g + V_gp)/(V_r C_g),        N² = n² P (C + q C_g) B / (A C_p),
@@ -312,6 +312,9 @@ class _Plan:
         shared, alone = _of_photons(found.wide_a - found.wide_b, weight)
         mid_shared, mid_alone = _of_photons(a - b, weight)
         alone, mid_alone = filtered * alone, filtered * mid_alone
+        # Neighbours have these in common, as far as kernels reach: a few pixels.
+        root = math.sqrt(filtered)
+        shared, mid_shared = root * shared, root * mid_shared
         v_alone = max(0.0, float(mid_alone.mean()))
         changed_a, changed_b = found.wide_a - a, found.wide_b - b
         change = changed_a[:, 0] * changed_b[:, 1] + changed_a[:, 1] * changed_b[:, 0]
