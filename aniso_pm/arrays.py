@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-# A multiple of what any machine reads at once.
-_LANES = 64
+# Multiples of what any machine reads at once: numbers, bytes.
+_LANES, _ALIGNED = 64, 64
 
 
 def own(kind, values: np.ndarray):
@@ -15,10 +15,13 @@ def own(kind, values: np.ndarray):
     ``kind(values)`` uses NumPy's memory as it lies. The LLVM backend (Dr.Jit 1.5) reads whole
     vectors from it, up to 60 bytes beyond its end, which ends the process where the next page is
     not mapped; and where memory is not aligned its kernels are others, compiled beside those for
-    memory that is.
+    memory that is. So the values first go where a multiple of _LANES of them is aligned.
     """
-    count = values.size
-    padded = np.zeros(-(-max(count, 1) // _LANES) * _LANES, values.dtype)
+    count, size = values.size, values.dtype.itemsize
+    room = -(-max(count, 1) // _LANES) * _LANES * size
+    memory = np.zeros(room + _ALIGNED, np.uint8)
+    start = -memory.ctypes.data % _ALIGNED
+    padded = memory[start : start + room].view(values.dtype)
     padded[:count] = values.ravel()
     array = kind(padded) + dr.opaque(kind, 0)
     dr.eval(array)

@@ -162,7 +162,7 @@ def noise_share(film) -> float:
     the plain mean of a pixel's own ones: ∫f²/(∫f)² over the plane, in pixels; 1 for a box."""
     rfilter = film.rfilter()
     radius = rfilter.radius()
-    x = mi.Float(((np.arange(_STEPS) + 0.5) / _STEPS * radius).astype(np.float32))
+    x = (dr.arange(mi.Float, _STEPS) + 0.5) * (radius / _STEPS)
     f = np.broadcast_to(rfilter.eval(x).numpy().astype(np.float64), _STEPS)
     return float(((f**2).mean() / f.mean() ** 2 / (2 * radius)) ** 2)
 
