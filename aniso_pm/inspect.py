@@ -176,8 +176,7 @@ def decided(scene: Prepared) -> tuple[Prepared, list[str]]:
         return scene, [f"map=auto: {causes[0]}"]
     sensor = scene.scene.sensors()[0]
     spp, pixels = sensor.sampler().sample_count(), pixel_count(sensor.film())
-    given = settings.photon_count or None, settings.initial_radius or None
-    found = settle(scene, sensor, 0, shares(settings, spp, pixels).each, *given)
+    found = settle(scene, sensor, 0, shares(settings, spp, pixels).each)
     return replace(scene, chosen=found.use), [f"map=auto: {as_promises(found.errors)}"]
 
 

@@ -64,12 +64,13 @@ class Settled:
     widths: np.ndarray
 
 
-def settle(scene: Prepared, sensor, seed: int, each: int, count=None, radius=None) -> Settled:
-    """What is not given is chosen, by a function of scene, parameters and seed.
+def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
+    """What the parameters do not give is chosen, by a function of scene, parameters and seed.
 
     each: eye samples of a pixel in a pass.
     """
     colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
+    count, radius = scene.settings.photon_count, scene.settings.initial_radius
     if scene.undecided:
         scene = replace(scene, chosen="survey")
     pilot = scene.with_(photon_count=_PATHS)
@@ -78,7 +79,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int, count=None, radius=Non
         else photons.EMPTY
         for k in (0, 1)
     ]  # fmt: skip
-    found = survey.look(scene, sensor, radius, seed, each, maps, count)
+    found = survey.look(scene, sensor, radius or None, seed, each, maps, count)
     count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
     radius = radius or radius_at(found.points, found.map, scene, count)
     return Settled(found.use, found.errors, count, radius, found.share, found.counts, found.widths)

@@ -156,12 +156,11 @@ class _Run:
         known = earlier.identity if earlier else {}
         each = self.shares.each
         # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
-        given = settings.photon_count or None, settings.initial_radius or None
-        found = settle(self.scene, self.sensor, self.seed, each, *given)
+        found = settle(self.scene, self.sensor, self.seed, each)
         use = known.get("use of the map") or found.use
         self.scene = replace(self.scene, chosen=use)
-        count = given[0] or known.get("photon count") or found.count
-        self.radius0 = given[1] or known.get("initial radius") or found.radius
+        count = settings.photon_count or known.get("photon count") or found.count
+        self.radius0 = settings.initial_radius or known.get("initial radius") or found.radius
         self.share = known.get("share of gathers") or found.share
         self.allotment = Allotment(films.pixel_count(self.film), each, found.counts)
         self.scene = self.scene.with_(photon_count=count)

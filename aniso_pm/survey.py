@@ -260,8 +260,8 @@ def _has_found(caustic, light, weight) -> bool:
 
 @dataclass(frozen=True)
 class _Plan:
-    """The best that can be done with a use of the map; see the module's head. error: relative MSE.
-    noise, work: of each pair."""
+    """The best that can be done with a use of the map; see the module's head and ``Survey``. widths
+    are those of tiles, error is the relative MSE."""
 
     tiles: Tiles
     use: str

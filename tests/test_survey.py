@@ -24,8 +24,8 @@ def test_a_scene_without_photons_needs_none_and_no_gathers(variant_llvm_rgb):
 
 def test_what_is_given_is_kept(variant_llvm_rgb):
     scene = mi.load_dict(room_with_ball(size=16))
-    prepared = prepare(scene, Settings(map="global"), False)
-    found = pilot.settle(prepared, scene.sensors()[0], 0, 16, count=12_345, radius=0.07)
+    given = Settings(map="global", photon_count=12_345, initial_radius=0.07)
+    found = pilot.settle(prepare(scene, given, False), scene.sensors()[0], 0, 16)
     assert (found.count, found.radius) == (12_345, 0.07)
     assert (found.widths == 1).all()  # no widths beside a radius that was given
 

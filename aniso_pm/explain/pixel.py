@@ -67,11 +67,10 @@ def explain(
     spp = sensor.sampler().sample_count()
     pixels = film.pixel_count(sensor.film())
     each = shares(settings, spp, pixels).each
-    wanted = settings.photon_count or None, settings.initial_radius or None
-    settled = settle(prepared, sensor, seed, each, *wanted)
+    settled = settle(prepared, sensor, seed, each)
     if settled.use == "none" and prepared.undecided:  # kernels are asked for
         prepared = prepared.with_(map="global")
-        settled = settle(prepared, sensor, seed, each, *wanted)
+        settled = settle(prepared, sensor, seed, each)
     prepared = replace(prepared, chosen=settled.use)
     count, radius0 = settled.count, settled.radius
     # Photon by photon, so that those that are shown are those that are summed.
