@@ -1,6 +1,8 @@
 """Fixtures that set a Mitsuba variant for one test and set the earlier one again afterwards."""
 
 import aniso_pm  # noqa: F401  (before drjit, so that it can choose LLVM)  # isort: skip
+import time
+
 import mitsuba as mi
 import pytest
 
@@ -33,3 +35,17 @@ def variant_llvm_spectral():
 @pytest.fixture(params=VARIANTS)
 def variants_all(request):
     yield from _use(request.param)
+
+
+@pytest.fixture
+def ticking(monkeypatch):
+    """A clock by which each look at it takes a millisecond, however busy the machine is. Returns
+    a function that lets more time go by."""
+    now = [time.perf_counter()]
+
+    def pass_by(seconds):
+        now[0] += seconds
+        return now[0]
+
+    monkeypatch.setattr(time, "perf_counter", lambda: pass_by(0.001))
+    return pass_by

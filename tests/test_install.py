@@ -25,7 +25,7 @@ def run_python(code, tmp_path, library=None):
         environment[_llvm.VARIABLE] = str(library)
     command = [sys.executable, "-c", code]
     return subprocess.run(
-        command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=120
+        command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600
     )
 
 

@@ -24,7 +24,7 @@ def test_notebooks_are_stored_without_outputs(path):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run_and_show_pictures(path):
     notebook = read(path)
-    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": path.parent}}).execute()
+    NotebookClient(notebook, timeout=900, resources={"metadata": {"path": path.parent}}).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     # What widgets show, errors included, is in their own state.
     widgets = notebook.metadata.get("widgets", {})
