@@ -39,6 +39,7 @@ from .photons import (
     segments,
 )
 from .receivers import gathered_part
+from .spectra import channel_mean
 
 CUT2 = 4.0
 KERNEL_MASS = 1 - math.exp(-CUT2)
@@ -122,6 +123,7 @@ def estimate(
     active,
     surface=None,
     tolerance: float = 0,
+    scores=None,
 ):
     """(reflected radiance, photons inside the kernel) of each gather point, edges not yet
     compensated.
@@ -130,6 +132,8 @@ def estimate(
                the map does not already keep).
     surface    Surface of receivers that are not Lambertian.
     tolerance  of the sum, relative to the flux in the kernel, if the map has sums; see ``summed``.
+    scores     None, or (column, weight): what each photon gives to each point, squared, times the
+               point's weight, is added to the photon's entry in the column.
     """
     ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
     counts = _filter(points, max_depth)
@@ -140,6 +144,9 @@ def estimate(
         light = photon_flux(photons, slot, inside) * dr.select(inside, dr.exp(-rho2), 0)
         if surface is not None:
             light *= surface.brdf(photon_direction(photons, slot, inside), inside)
+        if scores is not None:
+            given = channel_mean(light * points.weight) * unit
+            dr.scatter_add(scores[0], scores[1] * dr.square(given), slot, inside)
         # Kahan's sum: what rounding took from the total goes into the next term. A plain sum is
         # off by 1 % after a million equal photons.
         term = light - missing
@@ -161,11 +168,11 @@ def estimate(
     if photons.sums is not None and surface is None:
         whole = 0.5 * tolerance, math.exp(-CUT2), visit_node
     total = (mi.Spectrum(0), mi.Spectrum(0), mi.UInt32(0))
-    reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active, whole)
     area = dr.pi * dr.sqrt(dr.squared_norm(kernel.s)) * dr.sqrt(dr.squared_norm(kernel.t))
     # As a literal, their number would be compiled into the kernel.
-    paths = dr.opaque(mi.Float, photons.emitted)
-    return points.weight * reflected / (area * KERNEL_MASS * paths), count
+    unit = dr.rcp(area * KERNEL_MASS * dr.opaque(mi.Float, photons.emitted))
+    reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active, whole)
+    return points.weight * reflected * unit, count
 
 
 def _filter(points: GatherPoints, max_depth):

@@ -19,6 +19,8 @@ side can see but sampling from the light's side never finds. There half of the s
 drawn from the cosine hemisphere, all are weighted by the BSDF as the viewer evaluates it, f(v, l)
 with v the direction in which light leaves, and delta bounces by the cosines to their own normal.
 
+Light paths begin evenly over what emitters emit, or where they are told to (see ``aim``).
+
 Photons are counted while they are stored. If a buffer turns out too small it is enlarged to the
 count and the same paths are traced again: none is ever lost.
 """
@@ -30,8 +32,10 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from . import index as spatial
+from .aim import Aim
 from .emission import Emission, only_photons_see
 from .rays import largest_coordinate, spawn_ray
 from .receivers import gathered_part, read_bent, read_receiver
@@ -55,6 +59,8 @@ class TraceOptions:
     unseen_light  the scene has direct light that only photons can find.
     bent          the scene has bump or normal maps.
     wavelengths   nm, of all photons (spectral variants), else None.
+    aim           aim.Aim, where light paths do not begin evenly.
+    remember      the map is to know where its light paths began (PhotonMap.origins).
     """
 
     max_depth: int
@@ -65,6 +71,8 @@ class TraceOptions:
     unseen_light: bool
     bent: bool
     wavelengths: Any = None
+    aim: Aim | None = None
+    remember: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,7 @@ class PhotonMap:
     direction  where the light came from, 32 bits octahedral; None where no receiver needs it.
     wavelengths  nm, in spectral variants; the flux is W/nm then.
     sums       summed.Sums of the index's nodes, or None.
+    origins    Origins, or None.
     """
 
     emitted: int
@@ -90,6 +99,19 @@ class PhotonMap:
     direction: Any
     wavelengths: Any
     sums: Any = None
+    origins: Origins | None = None
+
+
+@dataclass(frozen=True)
+class Origins:
+    """Where the photons of a map come from.
+
+    path     number of the light path that left the photon in each slot (mi.UInt32).
+    numbers  the five random numbers with which each path began, (paths, 5).
+    """
+
+    path: Any
+    numbers: np.ndarray
 
 
 EMPTY = PhotonMap(0, 0, 0, None, None, None, None)
@@ -129,7 +151,10 @@ def build_map(
         wavefront or WAVEFRONT,
     )
     lap("photons")
-    map_ = _indexed(photons, stored, PhotonMap(photon_count, 0, rejected, *[None] * 4))
+    nothing = PhotonMap(photon_count, 0, rejected, *[None] * 4)
+    if options.remember:
+        nothing = replace(nothing, origins=Origins(None, _beginnings(seed, photon_count)))
+    map_ = _indexed(photons, stored, nothing)
     lap("index")
     return replace(map_, wavelengths=options.wavelengths)
 
@@ -147,6 +172,7 @@ def caustics(map_: PhotonMap) -> PhotonMap:
         dr.reinterpret_array(mi.UInt32, point.w),
         photon_flux(map_, slot, True),
         None if map_.direction is None else dr.gather(mi.UInt32, map_.direction, slot),
+        None if map_.origins is None else dr.gather(mi.UInt32, map_.origins.path, slot),
     )
     dr.eval(photons)
     nothing = replace(map_, stored=0, index=None, flux=None, direction=None)
@@ -159,17 +185,27 @@ def _indexed(photons: _Photons, stored: int, nothing: PhotonMap) -> PhotonMap:
         return nothing
     index, order = spatial.build(_cut(photons, "position", stored), _cut(photons, "word", stored))
     # What has been put in order is dropped before the next column is.
-    direction = None
+    direction, origins = None, nothing.origins
     if photons.direction is not None:
         direction = dr.gather(mi.UInt32, _cut(photons, "direction", stored), order)
         dr.eval(direction)
+    if origins is not None:
+        origins = replace(origins, path=dr.gather(mi.UInt32, _cut(photons, "path", stored), order))
+        dr.eval(origins.path)
     sorted_flux = dr.empty(mi.Float, stored * _flux_width())
     flux = dr.gather(mi.Spectrum, _cut(photons, "flux", stored), order)
     dr.scatter(sorted_flux, pack_flux(flux), dr.arange(mi.UInt32, stored))
     del order, flux
     dr.eval(sorted_flux)
     spatial.give_back(stored)
-    return replace(nothing, stored=stored, index=index, flux=sorted_flux, direction=direction)
+    return replace(
+        nothing,
+        stored=stored,
+        index=index,
+        flux=sorted_flux,
+        direction=direction,
+        origins=origins,
+    )
 
 
 def photon_flux(photons: PhotonMap, slot, active):
@@ -259,6 +295,7 @@ class _Photons:
     word: Any
     flux: Any
     direction: Any
+    path: Any
 
 
 def _cut(photons, name: str, entries: int):
@@ -279,13 +316,13 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefro
             dr.empty(mi.UInt32, capacity),
             dr.empty(mi.Spectrum, capacity),
             dr.empty(mi.UInt32, capacity) if options.general else None,
+            dr.empty(mi.UInt32, capacity) if options.remember else None,
         )
         stored, rejected = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0)
         room = dr.opaque(mi.UInt32, capacity)
         for first in range(0, photon_count, wavefront):
-            sampler = mi.load_dict({"type": "independent"})
-            own = mi.sample_tea_32(seed, first // wavefront)[0]
-            sampler.seed(dr.opaque(mi.UInt32, own), min(wavefront, photon_count - first))
+            count = min(wavefront, photon_count - first)
+            sampler = _random(seed, first // wavefront, count)
             photons, stored, rejected = launch(
                 scene, source, sampler, options, photons, stored, rejected, room
             )
@@ -298,13 +335,32 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefro
         spatial.give_back(count)
 
 
+def _random(seed: int, wavefront: int, count: int):
+    """Sampler of the light paths of a wavefront."""
+    sampler = mi.load_dict({"type": "independent"})
+    own = mi.sample_tea_32(seed, wavefront)[0]
+    sampler.seed(dr.opaque(mi.UInt32, own), count)
+    return sampler
+
+
+def _beginnings(seed: int, count: int) -> np.ndarray:
+    """The numbers with which light paths of the first wavefront begin, (paths, 5)."""
+    u1, u2, u3 = _first_numbers(_random(seed, 0, count))
+    return np.stack([v.numpy() for v in (u1, u2.x, u2.y, u3.x, u3.y)], 1)
+
+
+def _first_numbers(sampler):
+    """For emitter, place, direction."""
+    return sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+
+
 def light_paths(scene, source, sampler, options, photons, stored, rejected, room):
     """One wavefront of light paths into the buffers; returns what it has changed."""
 
     def reject(active):
         dr.scatter_add(rejected, mi.UInt32(1), mi.UInt32(0), active)
 
-    def store(position, word, flux, direction, active):
+    def store(position, word, flux, direction, path, active):
         slot = dr.scatter_inc(stored, mi.UInt32(0), active)
         active = active & (slot < room)
         dr.scatter(photons.position, position, slot, active)
@@ -312,6 +368,8 @@ def light_paths(scene, source, sampler, options, photons, stored, rejected, room
         dr.scatter(photons.flux, flux, slot, active)
         if options.general:
             dr.scatter(photons.direction, _encode(direction, 16), slot, active)
+        if options.remember:
+            dr.scatter(photons.path, path, slot, active)
 
     _trace_wavefront(scene, source, sampler, options, store, reject)
     return photons, stored, rejected
@@ -325,13 +383,15 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
     reach = dr.opaque(mi.Float, largest_coordinate(scene))
 
     # --- Leave the emitter ---
-    ray, emitted, emitter = source.sample_ray(
-        mi.Float(0),
-        sampler.next_1d(),
-        sampler.next_2d(),
-        sampler.next_2d(),
-        wavelengths=o.wavelengths,
-    )
+    numbers = _first_numbers(sampler)
+    path = dr.arange(mi.UInt32, dr.width(numbers[0]))
+    worth = mi.Float(1)
+    if dr.hint(o.aim is not None, mode="scalar"):
+        # Stratified: path k of n chooses between k/n and (k + 1)/n.
+        share = dr.rcp(dr.opaque(mi.Float, dr.width(path)))
+        *numbers, worth = o.aim((mi.Float(path) + sampler.next_1d()) * share, *numbers)
+    ray, emitted, emitter = source.sample_ray(mi.Float(0), *numbers, wavelengths=o.wavelengths)
+    emitted *= worth
     finite = dr.all(dr.isfinite(emitted))
     reject(~finite)
     shortest = mi.UInt32(2)  # Segments of the shortest path that is stored
@@ -369,7 +429,7 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
         word = encode_normal(side) | (dr.minimum(depth, SEGMENTS_MAX) << 24)
         if dr.hint(o.caustics == "marked", mode="scalar"):
             word |= dr.select(caustic, mi.UInt32(1 << 31), mi.UInt32(0))
-        store(si.p, word, power, -ray.d, deposit)
+        store(si.p, word, power, -ray.d, path, deposit)
 
         # --- Scatter ---
         active &= depth < max_depth

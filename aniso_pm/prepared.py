@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import density, emission, eye, photons, summed
+from .aim import Aim
 from .footprint import Footprint
 from .needs import Needs, read_scene
 from .settings import Settings
@@ -59,6 +60,7 @@ class Prepared:
     light_wavefront: int | None = None  # light paths at once; None: photons.WAVEFRONT
     footprint: Footprint | None = None  # of pixels; None: one bandwidth for all of a pass
     chosen: str | None = None  # use of the map that a pilot has found best, see ``undecided``
+    aim: Aim | None = None  # of light paths, if a pilot has found that it pays
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -177,11 +179,12 @@ class Prepared:
         expected: int = 0,
         wavelengths=None,
         lap=lambda stage: None,
+        remember: bool = False,
     ) -> photons.PhotonMap:
         """Photon map of pass ``index``; empty where nothing in the scene could use one.
 
         wavelengths: nm, of the photons, in spectral variants. lap: called with the name of each
-        stage that ends, "photons" and "index".
+        stage that ends, "photons" and "index". remember: where light paths began.
         """
         if not self.needs_map:
             return photons.EMPTY
@@ -195,6 +198,8 @@ class Prepared:
             bool(self.needs.unseen),
             bool(self.needs.bent),
             wavelengths,
+            self.aim,
+            remember,
         )
         seed = stream_seed(seed, PHOTONS, index)
         map_ = photons.build_map(

@@ -194,8 +194,8 @@ def test_a_cell_that_fails_does_not_take_the_others_with_it(
         return run(stage, method, radius, seed, budgets)
 
     monkeypatch.setattr(runs, "run", failing)
-    names = ("--method", "path", "--method", "isotropic/default", "--seeds", "4", "--budgets", "1")
-    arguments = ["report", str(scene), "-o", str(tmp_path), *QUICK, *names]
+    names = ("--method", "path", "--method", "isotropic/default", "--seeds", "4", "--budgets", "2")
+    arguments = ["report", str(scene), "-o", str(tmp_path), *QUICK, *names, "--time", "0.3"]
     assert cli.main(arguments) == 1
     assert "path, seed 1 failed: the lamp fell over" in capfd.readouterr().out
     found = results(tmp_path)
