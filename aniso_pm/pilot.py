@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import density, eye, photons, survey
+from . import aim, density, eye, photons, survey
 from .film import one_each, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 
@@ -53,6 +53,7 @@ class Settled:
     share   of the eye paths that gather (see ``eye.Thinning``).
     counts  samples of each pixel in a pass (see ``allotment``), or None: all alike.
     widths  of the kernels of each pixel, in pixels (see ``footprint``).
+    aim     of light paths (aim.Learned), or None: they begin evenly.
     """
 
     use: str
@@ -62,6 +63,12 @@ class Settled:
     share: float
     counts: np.ndarray | None
     widths: np.ndarray
+    aim: aim.Learned | None
+
+    def applied(self, scene: Prepared) -> Prepared:
+        """The scene with the use of its map, and with the number and aim of light paths."""
+        scene = replace(scene, chosen=self.use, aim=self.aim.aim() if self.aim else None)
+        return scene.with_(photon_count=self.count)
 
 
 def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
@@ -75,14 +82,26 @@ def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
         scene = replace(scene, chosen="survey")
     pilot = scene.with_(photon_count=_PATHS)
     maps = [
-        pilot.photon_map(stream_seed(seed, PILOT), k, wavelengths=colours) if scene.needs_map
+        pilot.photon_map(stream_seed(seed, PILOT), k, 0, colours, remember=True)
+        if scene.needs_map
         else photons.EMPTY
         for k in (0, 1)
-    ]  # fmt: skip
+    ]
     found = survey.look(scene, sensor, radius or None, seed, each, maps, count)
     count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
-    radius = radius or radius_at(found.points, found.map, scene, count)
-    return Settled(found.use, found.errors, count, radius, found.share, found.counts, found.widths)
+    # Aimed photons are closer together where they show.
+    worth = count / found.aim.variance if found.aim else count
+    radius = radius or radius_at(found.points, found.map, scene, worth)
+    return Settled(
+        found.use,
+        found.errors,
+        count,
+        radius,
+        found.share,
+        found.counts,
+        found.widths,
+        found.aim,
+    )
 
 
 def _rounded(number: float) -> int:
@@ -116,7 +135,7 @@ def automatic_radius(scene: Prepared, rays, seed: int, map_=None) -> float:
     return radius_at(points, map_, scene, scene.settings.photon_count)
 
 
-def radius_at(points, map_, scene: Prepared, light_paths: int) -> float:
+def radius_at(points, map_, scene: Prepared, light_paths: float) -> float:
     """Bandwidth (world units) at which kernels hold PHOTONS_PER_KERNEL photons of so many light
     paths, in the median over gather points (GatherPoints or None).
 

@@ -240,16 +240,18 @@ class Prepared:
         return eye.trace(self.scene, sampler, ray, options, expected, launch)
 
     def gather(
-        self, map_, radius, seed: int, points: eye.GatherPoints, wavelengths=None
+        self, map_, radius, seed: int, points: eye.GatherPoints, wavelengths=None, scores=None
     ) -> list[density.Gathered]:
         """Reflected radiance at gather points, edges compensated where that is asked for.
 
         radius       bandwidth, world units; a Dr.Jit array, so that its value is no part of the
                      kernel.
         wavelengths  nm, of the eye paths, in spectral variants.
+        scores       None, or a column of zeros, one for each photon, and the weight of each eye
+                     path (see ``density.estimate``).
         """
         if points.lambertian is None:
-            return [self._gather(map_, radius, seed, points, None)]
+            return [self._gather(map_, radius, seed, points, None, scores)]
         parts = []
         for general in (False, True):
             index = dr.compress(points.lambertian != general)
@@ -259,7 +261,7 @@ class Prepared:
                 if general:
                     roughness = self.settings.gather_roughness
                     surface = density.Surface.at(self.scene, some, roughness, wavelengths)
-                parts.append(self._gather(map_, radius, seed, some, surface))
+                parts.append(self._gather(map_, radius, seed, some, surface, scores))
         return parts
 
     def bandwidth(self, points: eye.GatherPoints, radius):
@@ -268,7 +270,9 @@ class Prepared:
             return radius
         return radius * self.footprint.share(points.distance, points.lane)
 
-    def _gather(self, map_, radius, seed, points, surface) -> density.Gathered:
+    def _gather(self, map_, radius, seed, points, surface, scores) -> density.Gathered:
+        if scores is not None:
+            scores = scores[0], dr.gather(mi.Float, scores[1], points.lane)
         radius = self.bandwidth(points, radius)
         kernel, follows, degenerate = density.kernels(points, radius, self.kernel_options)
         L, count = density.estimate(
@@ -280,6 +284,7 @@ class Prepared:
             mi.Bool(True),
             surface,
             self.settings.gather_tolerance,
+            scores,
         )
         lost = mi.Bool(False)
         if self.settings.edge_compensation:

@@ -158,12 +158,11 @@ class _Run:
         # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
         found = settle(self.scene, self.sensor, self.seed, each)
         use = known.get("use of the map") or found.use
-        self.scene = replace(self.scene, chosen=use)
         count = settings.photon_count or known.get("photon count") or found.count
+        self.scene = replace(found, use=use, count=count).applied(self.scene)
         self.radius0 = settings.initial_radius or known.get("initial radius") or found.radius
         self.share = known.get("share of gathers") or found.share
         self.allotment = Allotment(films.pixel_count(self.film), each, found.counts)
-        self.scene = self.scene.with_(photon_count=count)
         self.plan = memory.plan(self.scene, *self._job())
         self.scene = replace(self.scene, light_wavefront=self.plan.light_paths)
         if not settings.initial_radius:
@@ -189,6 +188,7 @@ class _Run:
             "share_of_gathers": self.share,
             "photon_count": count,
             "photon_count_automatic": settings.photon_count == 0,
+            "aim": found.aim and found.aim.gains(),
             "map": use,
             "map_errors": found.errors,
             "memory_estimate": self.plan.bytes / memory.GIB,

@@ -9,7 +9,7 @@ from .prepared import COLOUR, stream_seed
 from .settings import Settings
 
 # Eye samples of a pass where the number of passes is open: short against any budget.
-OPEN_PASS = 1 << 18
+OPEN_PASS = 1 << 19
 
 
 def bandwidth(initial_radius: float, alpha: float, index: int) -> float:

@@ -52,7 +52,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import eye, footprint, photons
+from . import aim, arrays, eye, footprint, photons
 from .film import noise_share, rays_through, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 from .spectra import channel_mean
@@ -63,8 +63,8 @@ _NARROW, _WIDE = 4.0, 8.0
 _THINNEST, _WIDEST = 1.0, 32.0
 # Passes that the widths are right for, however many there will be: passes add up.
 _PASSES = 32
-# Smallest share of eye paths that gather, and smallest number of them in a pixel and pass.
-_LEAST_SHARE, _GATHERS_PER_PIXEL = 1 / 8, 2
+# Smallest share of eye paths that gather.
+_LEAST_SHARE = 1 / 8
 # Work of an eye path: of its first ray, of a vertex.
 _CAMERA, _VERTEX = 0.3, 0.4
 # Work of a gather, each photon it meets, a light path, a photon it leaves; an eye path is about 1.
@@ -93,6 +93,7 @@ class Survey:
     light_paths  of a pass; 0 where photons do not show.
     counts       samples of each pixel (see ``allotment``), or None: all alike.
     widths       of the kernels of each pixel, in pixels.
+    aim          of light paths (aim.Learned), or None: they begin evenly.
     map, points  a map of that use, and where eye paths read it (GatherPoints); None where none do.
     """
 
@@ -102,6 +103,7 @@ class Survey:
     light_paths: float
     counts: np.ndarray | None
     widths: np.ndarray
+    aim: aim.Learned | None
     map: photons.PhotonMap | None
     points: Any
 
@@ -119,7 +121,7 @@ def look(
     """
     tiles = Tiles.of(sensor)
     seen = _trace(scene, sensor, tiles, seed)
-    read = partial(_read, scene, sensor, radius, seed, tiles.lanes)
+    read = partial(_read, scene, sensor, radius, seed, tiles)
     filtered = noise_share(sensor.film())
     decide = partial(_Plan.of, tiles, radius is None, each, light_paths, filtered, seen.work)
     if seen.points is None or not min(map_.stored for map_ in maps):
@@ -130,16 +132,17 @@ def look(
         weight = tiles.weight(light)
         return decide(use, weight, _within(light, light, weight)).survey({}, None, None)
     own = seen.own
+    weigh = lambda gathered: tiles.weight(own + gathered)  # noqa: E731
     if scene.use != "survey":
-        found = read(maps, seen.points)
-        weight = tiles.weight(own + found.light)
+        found = read(maps, seen.points, weigh)
+        weight = weigh(found.light)
         plan = decide(scene.use, weight, _within(own, own, weight), found)
         return plan.survey({}, maps[0], seen.points)
 
     # --- The global map ---
     first = eye.take(seen.points, dr.compress(~seen.points.caustic))
-    found = read(maps, first)
-    weight = tiles.weight(own + found.light)
+    found = read(maps, first, weigh)
+    weight = weigh(found.light)
     v_own = _within(own, own, weight)
     best = decide("global", weight, v_own, found, work=seen.early)
     errors: dict[str, float | None] = {"global": best.error}
@@ -152,7 +155,7 @@ def look(
     if bare.error < limit:
         maps = [photons.caustics(map_) for map_ in maps]
         any_ = replace(seen.points, caustic=dr.full(mi.Bool, False, dr.width(seen.points.lane)))
-        found = read(maps, any_)
+        found = read(maps, any_, lambda _: weight)
         plan = decide("caustic", weight, v_own, found, later=more)
         errors["caustic"] = plan.error
         if plan.error < limit:
@@ -216,7 +219,7 @@ def _trace(scene: Prepared, sensor, tiles: Tiles, seed: int) -> _Seen:
 class _Found:
     """What a use of the map gives to the pairs: light from map a, b through narrow kernels and
     through wide ones, (pairs, 2); photons that an eye path meets, gather points that it leaves;
-    light paths and photons of a map."""
+    light paths and photons of a map; how to aim those."""
 
     a: np.ndarray
     b: np.ndarray
@@ -226,27 +229,54 @@ class _Found:
     points: float
     emitted: int
     stored: int
+    aim: aim.Learned | None
 
     @property
     def light(self) -> np.ndarray:
         return 0.5 * (self.wide_a + self.wide_b)
 
 
-def _read(scene: Prepared, sensor, radius, seed: int, lanes: int, maps, points) -> _Found:
+def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points, weigh) -> _Found:
+    """weigh: pairs of gathered light → weight of each pair."""
     colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
-    found = []
-    for width in (_NARROW, _WIDE) if not radius else (1.0,):
+    lanes, found, scores = tiles.lanes, [], None
+    for width in (_NARROW, _WIDE) if not radius else (1.0, 1.0):
         size = radius
         if not radius:  # kernels as wide as they are told to be
             size = 0.1 * scene.extent
             free = footprint.of(sensor, size, width)
             free = replace(free, least=dr.opaque(mi.Float, 1e-6))
             scene = replace(scene, footprint=free)
-        found.append([_gathered(scene, m, size, seed, points, colours, lanes) for m in maps])
+        if found:
+            weight = weigh(0.5 * (found[0][0][0] + found[0][1][0]))
+            weight = arrays.own(mi.Float, np.repeat(weight, 2 * SAMPLES).astype(np.float32))
+            scores = [(dr.zeros(mi.Float, max(map_.stored, 1)), weight) for map_ in maps]
+        found.append(
+            [
+                _gathered(scene, map_, size, seed, points, colours, lanes, scores and scores[k])
+                for k, map_ in enumerate(maps)
+            ]
+        )
     (a, met), (b, _) = found[0]
-    (wide_a, _), (wide_b, _) = found[-1]
+    (wide_a, _), (wide_b, _) = found[1]
     each = dr.width(points.lane) / lanes
-    return _Found(a, b, wide_a, wide_b, met, each, maps[0].emitted, maps[0].stored)
+    learned = _learned(maps, [column for column, _ in scores])
+    return _Found(a, b, wide_a, wide_b, met, each, maps[0].emitted, maps[0].stored, learned)
+
+
+def _learned(maps, columns) -> aim.Learned | None:
+    """How light paths should be aimed, from the scores of the photons of two maps."""
+    scores, left = [], []
+    for map_, column in zip(maps, columns, strict=True):
+        if not map_.stored:
+            return None
+        path, score = map_.origins.path.numpy(), np.nan_to_num(column.numpy(), posinf=0)
+        scores.append(np.bincount(path, score, map_.emitted))
+        left.append(np.bincount(path, minlength=map_.emitted))
+    photons_left = np.array(left, np.float64)
+    work = _LIGHT_PATH + _LEFT * photons_left
+    numbers = np.stack([map_.origins.numbers for map_ in maps])
+    return aim.learn(numbers, np.array(scores), work, photons_left)
 
 
 def _has_found(caustic, light, weight) -> bool:
@@ -270,6 +300,7 @@ class _Plan:
     widths: np.ndarray
     counts: np.ndarray | None
     error: float
+    aim: aim.Learned | None = None
 
     @staticmethod
     def of(
@@ -299,11 +330,10 @@ class _Plan:
         v_eye = _STRATIFIED * float(v_own.mean()) + _LATER_STRATIFIED * float(np.mean(later))
         v_eye = filtered * max(v_eye, 0.0)
         total = _PASSES * each * tiles.pixels * float(whole.mean())
-        least = max(_LEAST_SHARE, min(1.0, _GATHERS_PER_PIXEL / each))
         if found is None:
             error = v_eye * tiles.pixels * float(work.mean()) / total
             counts = tiles.counts(v_own + later, work, each)
-            share = 1.0 if use == "none" else least
+            share = 1.0 if use == "none" else _LEAST_SHARE
             return _Plan(tiles, use, share, 0.0, np.ones(1), counts, error)
 
         # --- Variances and bias² of each pair, relative to the light there ---
@@ -315,7 +345,7 @@ class _Plan:
         # Neighbours have these in common, as far as kernels reach: a few pixels.
         root = math.sqrt(filtered)
         shared, mid_shared = root * shared, root * mid_shared
-        v_alone = max(0.0, float(mid_alone.mean()))
+        v_alone, v_shared = (max(0.0, float(v.mean())) for v in (mid_alone, mid_shared))
         changed_a, changed_b = found.wide_a - a, found.wide_b - b
         change = changed_a[:, 0] * changed_b[:, 1] + changed_a[:, 1] * changed_b[:, 0]
         change *= 0.5 * weight
@@ -325,20 +355,31 @@ class _Plan:
         narrow, wide = (_NARROW, _WIDE) if choose else (1.0, 1.0)
         widths = np.full(len(whole), narrow)
         eye_work = float(work.mean())
-        light = _LIGHT_PATH + _LEFT * found.stored / emitted
+        light, met = _LIGHT_PATH + _LEFT * found.stored / emitted, found.met
+        aimed = 1.0
+        if found.aim:
+            light, met = light * found.aim.work, met * found.aim.photons
+            aimed = found.aim.variance
         for _ in range(_ROUNDS):
             own = 1 / (share * each)
-            b_1 = wide**2 * (shared + own * alone) + narrow**2 * (mid_shared + own * mid_alone)
-            b_1 *= 0.5 * emitted
+            # A pass that a pixel reads less than once counts when it is read.
+            often = max(1.0, own)
+            b_1 = wide**2 * (often * shared + own * alone)
+            b_1 += narrow**2 * (often * mid_shared + own * mid_alone)
+            b_1 *= 0.5 * emitted * aimed
             if choose:
                 widths = _widths(tiles, b_1, change, _PASSES * paths).ravel()
             area = float(np.mean((widths / narrow) ** 2))
-            thinner = float(np.mean((narrow / widths) ** 2)) * emitted / paths
-            gather = _GATHER * found.points + _MET * found.met * area * paths / emitted
+            thinner = float(np.mean((narrow / widths) ** 2)) * aimed * emitted / paths
+            gather = _GATHER * found.points + _MET * met * area * paths / emitted
             if v_eye > 0:
-                share = math.sqrt((v_gather + v_alone * thinner) * eye_work / (v_eye * gather))
+                worth = eye_work / (v_eye * gather)
+                share = math.sqrt((v_gather + v_alone * thinner) * worth)
+                if share * each < 1:  # then a gather is alone with what it would share
+                    more = math.sqrt((v_gather + (v_alone + v_shared) * thinner) * worth)
+                    share = min(more, 1 / each)
             # In steps, so that machines whose arithmetic differs in the last digits agree.
-            share = min(16, math.ceil(16 * max(least, share))) / 16
+            share = min(16, math.ceil(16 * max(_LEAST_SHARE, share))) / 16
             eye_noise = max(v_eye + v_gather / share, 1e-30)
             by_photons = max(0.0, float((b_1 / widths**2).mean()))
             if not light_paths:
@@ -349,14 +390,22 @@ class _Plan:
         error += _bias2(float(np.mean(change * (widths / _NARROW) ** 3))) if choose else 0.0
         noise = v_own + later + 0.5 * (_within(a, a, weight) + _within(b, b, weight)) / share
         counts = tiles.counts(noise, work + share * gather, each)
-        return _Plan(tiles, use, share, paths, widths, counts, error)
+        return _Plan(tiles, use, share, paths, widths, counts, error, found.aim)
 
     def survey(self, errors, map_, points) -> Survey:
         widths = self.widths
         if widths.size > 1:
             widths = self.tiles.to_pixels(self.tiles.grid(widths))
         return Survey(
-            self.use, errors, self.share, self.light_paths, self.counts, widths, map_, points
+            self.use,
+            errors,
+            self.share,
+            self.light_paths,
+            self.counts,
+            widths,
+            self.aim,
+            map_,
+            points,
         )
 
 
@@ -375,11 +424,11 @@ def _widths(tiles: Tiles, photons, change, light_paths: float) -> np.ndarray:
     return np.clip(fifth**0.2, _THINNEST, _WIDEST)
 
 
-def _gathered(scene, map_, radius, seed, points, colours, lanes):
+def _gathered(scene, map_, radius, seed, points, colours, lanes, scores):
     """(light of pairs, photons an eye path meets)."""
     light, met = dr.zeros(mi.Float, lanes), 0.0
     r = dr.opaque(mi.Float, radius)
-    for found in scene.gather(map_, r, seed, points, colours) if map_.stored else ():
+    for found in scene.gather(map_, r, seed, points, colours, scores) if map_.stored else ():
         dr.scatter_add(light, channel_mean(found.radiance), found.lane)
         met += float(dr.sum(mi.Float(found.photons))[0]) / lanes
     return _pairwise(light), met

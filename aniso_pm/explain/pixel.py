@@ -71,10 +71,9 @@ def explain(
     if settled.use == "none" and prepared.undecided:  # kernels are asked for
         prepared = prepared.with_(map="global")
         settled = settle(prepared, sensor, seed, each)
-    prepared = replace(prepared, chosen=settled.use)
-    count, radius0 = settled.count, settled.radius
+    radius0 = settled.radius
     # Photon by photon, so that those that are shown are those that are summed.
-    prepared = prepared.with_(photon_count=count, gather_tolerance=0.0)
+    prepared = settled.applied(prepared).with_(gather_tolerance=0.0)
     if not settings.initial_radius:
         width = settled.widths.reshape(film.sampled_size(sensor.film())[::-1])
         border = (width.shape[1] - sensor.film().crop_size().x) // 2
