@@ -41,7 +41,7 @@ class Thinning:
     chance, so that the mean is right, and of any number of consecutive samples that share within
     one or two, however they are spread over wavefronts and passes.
 
-    share   of the paths, above 0 and at most 1.
+    share   of the paths, above 0 and at most 1, of each lane.
     seed    of the choice.
     pixel   of each lane; sample: its number among the pixel's samples.
     """
@@ -52,9 +52,10 @@ class Thinning:
     sample: Any
 
     @staticmethod
-    def of(share: float, seed: int, pixel, sample) -> Thinning:
-        """For one wavefront."""
-        return Thinning(dr.opaque(mi.Float, share), dr.opaque(mi.UInt32, seed), pixel, sample)
+    def of(share, seed: int, pixel, sample) -> Thinning:
+        """For one wavefront. share: of each pixel (mi.Float)."""
+        share = dr.gather(mi.Float, share, pixel)
+        return Thinning(share, dr.opaque(mi.UInt32, seed), pixel, sample)
 
     def chosen(self):
         """Does the path of each lane gather?"""

@@ -50,7 +50,7 @@ class Settled:
     errors  relative MSE that each use promises, where there was a choice (see ``survey``).
     count   light paths per pass.
     radius  bandwidth of the first pass, world units.
-    share   of the eye paths that gather (see ``eye.Thinning``).
+    share   of the eye paths of each pixel that gather (see ``eye.Thinning``).
     counts  samples of each pixel in a pass (see ``allotment``), or None: all alike.
     widths  of the kernels of each pixel, in pixels (see ``footprint``).
     aim     of light paths (aim.Learned), or None: they begin evenly.
@@ -60,7 +60,7 @@ class Settled:
     errors: dict[str, float | None]
     count: int
     radius: float
-    share: float
+    share: np.ndarray
     counts: np.ndarray | None
     widths: np.ndarray
     aim: aim.Learned | None

@@ -22,6 +22,7 @@ from . import advice, digest, footprint, memory, state
 from . import film as films
 from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .allotment import Allotment
+from .arrays import own
 from .clock import Clock
 from .errors import is_interrupt
 from .eye import Thinning
@@ -161,7 +162,10 @@ class _Run:
         count = settings.photon_count or known.get("photon count") or found.count
         self.scene = replace(found, use=use, count=count).applied(self.scene)
         self.radius0 = settings.initial_radius or known.get("initial radius") or found.radius
-        self.share = known.get("share of gathers") or found.share
+        self.share = None  # of the eye paths of each pixel that gather; None: all do
+        if found.share.min() < 1:
+            pixels = films.pixel_count(self.film)
+            self.share = own(mi.Float, np.resize(found.share, pixels).astype(np.float32))
         self.allotment = Allotment(films.pixel_count(self.film), each, found.counts)
         self.plan = memory.plan(self.scene, *self._job())
         self.scene = replace(self.scene, light_wavefront=self.plan.light_paths)
@@ -180,12 +184,11 @@ class _Run:
                 "use of the map": use,
                 "initial radius": self.radius0,
                 "photon count": count,
-                "share of gathers": self.share,
             }
         self.statistics |= {
             "initial_radius": self.radius0,
             "radius_automatic": settings.initial_radius == 0,
-            "share_of_gathers": self.share,
+            "share_of_gathers": float(found.share.mean()),
             "photon_count": count,
             "photon_count_automatic": settings.photon_count == 0,
             "aim": found.aim and found.aim.gains(),
@@ -328,7 +331,7 @@ class _Run:
             ray, ray_weight, position = films.sample_rays(sensor, sampler, lanes.pixel, colour)
             dr.eval(ray, ray_weight, position)
             thinning = None
-            if self.share < 1:
+            if self.share is not None:
                 random = stream_seed(self.seed, THINNING)
                 thinning = Thinning.of(self.share, random, lanes.pixel, lanes.sample)
 

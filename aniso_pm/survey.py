@@ -89,7 +89,7 @@ class Survey:
     use          of the map (see ``eye``).
     errors       relative MSE that each use promises, by its name, where there was a choice; None
                  where path tracing has not found what the map holds.
-    share        of the eye paths that should gather (see ``eye.Thinning``).
+    share        of the eye paths of each pixel that should gather (see ``eye.Thinning``).
     light_paths  of a pass; 0 where photons do not show.
     counts       samples of each pixel (see ``allotment``), or None: all alike.
     widths       of the kernels of each pixel, in pixels.
@@ -99,7 +99,7 @@ class Survey:
 
     use: str
     errors: dict[str, float | None]
-    share: float
+    share: np.ndarray
     light_paths: float
     counts: np.ndarray | None
     widths: np.ndarray
@@ -290,12 +290,12 @@ def _has_found(caustic, light, weight) -> bool:
 
 @dataclass(frozen=True)
 class _Plan:
-    """The best that can be done with a use of the map; see the module's head and ``Survey``. widths
-    are those of tiles, error is the relative MSE."""
+    """The best that can be done with a use of the map; see the module's head and ``Survey``. share
+    and widths are those of tiles, error is the relative MSE."""
 
     tiles: Tiles
     use: str
-    share: float
+    share: np.ndarray
     light_paths: float
     widths: np.ndarray
     counts: np.ndarray | None
@@ -333,25 +333,25 @@ class _Plan:
         if found is None:
             error = v_eye * tiles.pixels * float(work.mean()) / total
             counts = tiles.counts(v_own + later, work, each)
-            share = 1.0 if use == "none" else _LEAST_SHARE
+            share = np.full(1, 1.0 if use == "none" else _LEAST_SHARE)
             return _Plan(tiles, use, share, 0.0, np.ones(1), counts, error)
 
         # --- Variances and bias² of each pair, relative to the light there ---
         a, b, emitted = found.a, found.b, found.emitted
-        v_gather = filtered * max(0.0, float(_within(a, b, weight).mean()))
+        v_gather = tiles.trusted(filtered * _within(a, b, weight))
         shared, alone = _of_photons(found.wide_a - found.wide_b, weight)
         mid_shared, mid_alone = _of_photons(a - b, weight)
         alone, mid_alone = filtered * alone, filtered * mid_alone
         # Neighbours have these in common, as far as kernels reach: a few pixels.
         root = math.sqrt(filtered)
         shared, mid_shared = root * shared, root * mid_shared
-        v_alone, v_shared = (max(0.0, float(v.mean())) for v in (mid_alone, mid_shared))
+        v_alone, v_shared = tiles.trusted(mid_alone), tiles.trusted(mid_shared)
         changed_a, changed_b = found.wide_a - a, found.wide_b - b
         change = changed_a[:, 0] * changed_b[:, 1] + changed_a[:, 1] * changed_b[:, 0]
         change *= 0.5 * weight
 
         # --- Decisions ---
-        share, paths = 1.0, float(light_paths or 5 * emitted)
+        share, paths = np.ones(len(whole)), float(light_paths or 5 * emitted)
         narrow, wide = (_NARROW, _WIDE) if choose else (1.0, 1.0)
         widths = np.full(len(whole), narrow)
         eye_work = float(work.mean())
@@ -363,43 +363,45 @@ class _Plan:
         for _ in range(_ROUNDS):
             own = 1 / (share * each)
             # A pass that a pixel reads less than once counts when it is read.
-            often = max(1.0, own)
+            often = np.maximum(1, own)
             b_1 = wide**2 * (often * shared + own * alone)
             b_1 += narrow**2 * (often * mid_shared + own * mid_alone)
             b_1 *= 0.5 * emitted * aimed
             if choose:
                 widths = _widths(tiles, b_1, change, _PASSES * paths).ravel()
             area = float(np.mean((widths / narrow) ** 2))
-            thinner = float(np.mean((narrow / widths) ** 2)) * aimed * emitted / paths
+            thinner = (narrow / widths) ** 2 * aimed * emitted / paths
             gather = _GATHER * found.points + _MET * met * area * paths / emitted
             if v_eye > 0:
                 worth = eye_work / (v_eye * gather)
-                share = math.sqrt((v_gather + v_alone * thinner) * worth)
-                if share * each < 1:  # then a gather is alone with what it would share
-                    more = math.sqrt((v_gather + (v_alone + v_shared) * thinner) * worth)
-                    share = min(more, 1 / each)
+                share = np.sqrt((v_gather + v_alone * thinner) * worth)
+                # Less than one in a pass: then a gather is alone with what it would share.
+                more = np.sqrt((v_gather + (v_alone + v_shared) * thinner) * worth)
+                share = np.where(share * each < 1, np.minimum(more, 1 / each), share)
             # In steps, so that machines whose arithmetic differs in the last digits agree.
-            share = min(16, math.ceil(16 * max(_LEAST_SHARE, share))) / 16
-            eye_noise = max(v_eye + v_gather / share, 1e-30)
+            share = np.ceil(16 * np.clip(share, _LEAST_SHARE, 1)) / 16
+            eye_noise = max(v_eye + float((v_gather / share).mean()), 1e-30)
+            gather *= float(share.mean())
             by_photons = max(0.0, float((b_1 / widths**2).mean()))
             if not light_paths:
-                costs = (eye_work + share * gather) / (light * tiles.pixels)
+                costs = (eye_work + gather) / (light * tiles.pixels)
                 paths = max(each * tiles.pixels * math.sqrt(by_photons * costs / eye_noise), 1.0)
-        pass_ = each * tiles.pixels * (eye_work + share * gather) + paths * light
+        pass_ = each * tiles.pixels * (eye_work + gather) + paths * light
         error = (eye_noise / each + by_photons / paths) * pass_ / total
         error += _bias2(float(np.mean(change * (widths / _NARROW) ** 3))) if choose else 0.0
         noise = v_own + later + 0.5 * (_within(a, a, weight) + _within(b, b, weight)) / share
-        counts = tiles.counts(noise, work + share * gather, each)
+        counts = tiles.counts(noise, work + gather, each)
         return _Plan(tiles, use, share, paths, widths, counts, error, found.aim)
 
     def survey(self, errors, map_, points) -> Survey:
-        widths = self.widths
-        if widths.size > 1:
-            widths = self.tiles.to_pixels(self.tiles.grid(widths))
+        share, widths = (
+            self.tiles.to_pixels(self.tiles.grid(v)) if v.size > 1 else v
+            for v in (self.share, self.widths)
+        )
         return Survey(
             self.use,
             errors,
-            self.share,
+            share,
             self.light_paths,
             self.counts,
             widths,

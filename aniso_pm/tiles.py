@@ -92,6 +92,10 @@ class Tiles:
             return None
         return in_proportion(self.to_pixels(_allotted(smooth(noise), work)), each)
 
+    def trusted(self, noise) -> np.ndarray:
+        """Variance of each tile, from those of pairs, which may be negative."""
+        return _trusted(smooth(self.grid(noise))).ravel()
+
     def uncertainty(self, pairs) -> np.ndarray:
         """Half a standard error of smoothed means of pairs, in each tile."""
         squared = smooth(self.grid(pairs**2))
@@ -104,9 +108,12 @@ class Tiles:
 
 def _allotted(noise, work):
     """Samples of each tile as shares of the mean."""
-    noise = np.maximum(_TRUST * noise + (1 - _TRUST) * noise.mean(), 0)
-    share = np.sqrt(noise / work)
+    share = np.sqrt(_trusted(noise) / work)
     return np.clip(share / share.mean(), LEAST, MOST)
+
+
+def _trusted(noise):
+    return np.maximum(_TRUST * noise + (1 - _TRUST) * noise.mean(), 0)
 
 
 _BINOMIAL = np.array([1, 4, 6, 4, 1]) / 16
