@@ -50,6 +50,7 @@ class Settled:
     errors  relative MSE that each use promises, where there was a choice (see ``survey``).
     count   light paths per pass.
     radius  bandwidth of the first pass, world units.
+    each    eye samples of a pixel in a pass (see ``survey``).
     share   of the eye paths of each pixel that gather (see ``eye.Thinning``).
     counts  samples of each pixel in a pass (see ``allotment``), or None: all alike.
     widths  of the kernels of each pixel, in pixels (see ``footprint``).
@@ -60,6 +61,7 @@ class Settled:
     errors: dict[str, float | None]
     count: int
     radius: float
+    each: int
     share: np.ndarray
     counts: np.ndarray | None
     widths: np.ndarray
@@ -71,10 +73,11 @@ class Settled:
         return scene.with_(photon_count=self.count)
 
 
-def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
+def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False) -> Settled:
     """What the parameters do not give is chosen, by a function of scene, parameters and seed.
 
-    each: eye samples of a pixel in a pass.
+    each     eye samples of a pixel in a pass.
+    exactly  so many; else, where passes go on without end, there may be fewer.
     """
     colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
     count, radius = scene.settings.photon_count, scene.settings.initial_radius
@@ -87,7 +90,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
         else photons.EMPTY
         for k in (0, 1)
     ]
-    found = survey.look(scene, sensor, radius or None, seed, each, maps, count)
+    found = survey.look(scene, sensor, radius or None, seed, each, exactly, maps, count)
     count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
     # Aimed photons are closer together where they show.
     worth = count / found.aim.variance if found.aim else count
@@ -97,6 +100,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
         found.errors,
         count,
         radius,
+        found.each,
         found.share,
         found.counts,
         found.widths,

@@ -155,9 +155,11 @@ class _Run:
         settings, checkpoint = self.scene.settings, self.controls.checkpoint
         earlier = checkpoint.start() if checkpoint else None
         known = earlier.identity if earlier else {}
-        each = self.shares.each
         # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
-        found = settle(self.scene, self.sensor, self.seed, each)
+        exactly = known.get("samples per pixel of a pass")
+        each = exactly or self.shares.each
+        found = settle(self.scene, self.sensor, self.seed, each, bool(exactly))
+        self.shares = replace(self.shares, each=found.each)
         use = known.get("use of the map") or found.use
         count = settings.photon_count or known.get("photon count") or found.count
         self.scene = replace(found, use=use, count=count).applied(self.scene)
@@ -166,7 +168,7 @@ class _Run:
         if found.share.min() < 1:
             pixels = films.pixel_count(self.film)
             self.share = own(mi.Float, np.resize(found.share, pixels).astype(np.float32))
-        self.allotment = Allotment(films.pixel_count(self.film), each, found.counts)
+        self.allotment = Allotment(films.pixel_count(self.film), found.each, found.counts)
         self.plan = memory.plan(self.scene, *self._job())
         self.scene = replace(self.scene, light_wavefront=self.plan.light_paths)
         if not settings.initial_radius:
@@ -184,6 +186,7 @@ class _Run:
                 "use of the map": use,
                 "initial radius": self.radius0,
                 "photon count": count,
+                "samples per pixel of a pass": self.shares.each,
             }
         self.statistics |= {
             "initial_radius": self.radius0,

@@ -72,6 +72,8 @@ _GATHER, _MET, _LIGHT_PATH, _LEFT = 1.2, 1 / 40, 0.6, 0.4
 # Variance of an eye sample among a few hundred stratified ones, as a share of that among SAMPLES:
 # 0.59 among 52 and falling, in direct light.
 _STRATIFIED = 0.45
+# Work of a pass that is not to be exceeded where passes may have any length: a third of a second.
+_LONGEST = 1.5e6
 # Rounds in which the decisions, each of which depends on the others, settle.
 _ROUNDS = 4
 # Variance beyond the first gathered part, where stratification does less, as such a share.
@@ -89,6 +91,8 @@ class Survey:
     use          of the map (see ``eye``).
     errors       relative MSE that each use promises, by its name, where there was a choice; None
                  where path tracing has not found what the map holds.
+    each         eye samples of a pixel in a pass, in the mean: fewer than asked for where light
+                 paths would make a pass too long.
     share        of the eye paths of each pixel that should gather (see ``eye.Thinning``).
     light_paths  of a pass; 0 where photons do not show.
     counts       samples of each pixel (see ``allotment``), or None: all alike.
@@ -99,6 +103,7 @@ class Survey:
 
     use: str
     errors: dict[str, float | None]
+    each: int
     share: np.ndarray
     light_paths: float
     counts: np.ndarray | None
@@ -109,13 +114,13 @@ class Survey:
 
 
 def look(
-    scene: Prepared, sensor, radius: float | None, seed: int, each: int, maps, light_paths
+    scene: Prepared, sensor, radius, seed: int, each: int, exactly: bool, maps, light_paths
 ) -> Survey:
     """Trace the pairs, and decide.
 
     scene        where the use of the map is open: with ``chosen`` "survey".
     radius       bandwidth of the first pass, world units, if it is given: all kernels have it.
-    each         eye samples of a pixel in a pass, in the mean.
+    each, exactly  see ``pilot.settle``.
     maps         two independent photon maps of as many light paths, or empty ones.
     light_paths  of a pass if they are given, else 0 or None.
     """
@@ -123,7 +128,9 @@ def look(
     seen = _trace(scene, sensor, tiles, seed)
     read = partial(_read, scene, sensor, radius, seed, tiles)
     filtered = noise_share(sensor.film())
-    decide = partial(_Plan.of, tiles, radius is None, each, light_paths, filtered, seen.work)
+    longest = math.inf if exactly or scene.settings.passes else _LONGEST
+    given = radius is None, light_paths, filtered, seen.work
+    decide = partial(_Plan.of, longest, each, tiles, *given)
     if seen.points is None or not min(map_.stored for map_ in maps):
         use = scene.use
         if use == "survey":
@@ -291,22 +298,32 @@ def _has_found(caustic, light, weight) -> bool:
 @dataclass(frozen=True)
 class _Plan:
     """The best that can be done with a use of the map; see the module's head and ``Survey``. share
-    and widths are those of tiles, error is the relative MSE."""
+    and widths are those of tiles, error is the relative MSE, work that of a pass."""
 
     tiles: Tiles
     use: str
+    each: int
     share: np.ndarray
     light_paths: float
     widths: np.ndarray
     counts: np.ndarray | None
     error: float
+    work: float
     aim: aim.Learned | None = None
 
     @staticmethod
-    def of(
+    def of(longest: float, each: int, *given, **more) -> _Plan:
+        """Of passes whose work is ``longest`` at most, if they can be that short."""
+        plan = _Plan._of(each, *given, **more)
+        if plan.work > longest and each > 1:
+            plan = _Plan._of(max(1, int(each * longest / plan.work)), *given, **more)
+        return plan
+
+    @staticmethod
+    def _of(
+        each: int,
         tiles: Tiles,
         choose: bool,
-        each: int,
         light_paths: int | None,
         filtered: float,
         whole,
@@ -331,10 +348,11 @@ class _Plan:
         v_eye = filtered * max(v_eye, 0.0)
         total = _PASSES * each * tiles.pixels * float(whole.mean())
         if found is None:
-            error = v_eye * tiles.pixels * float(work.mean()) / total
+            pass_ = each * tiles.pixels * float(work.mean())
+            error = v_eye / each * pass_ / total
             counts = tiles.counts(v_own + later, work, each)
             share = np.full(1, 1.0 if use == "none" else _LEAST_SHARE)
-            return _Plan(tiles, use, share, 0.0, np.ones(1), counts, error)
+            return _Plan(tiles, use, each, share, 0.0, np.ones(1), counts, error, pass_)
 
         # --- Variances and bias² of each pair, relative to the light there ---
         a, b, emitted = found.a, found.b, found.emitted
@@ -391,7 +409,7 @@ class _Plan:
         error += _bias2(float(np.mean(change * (widths / _NARROW) ** 3))) if choose else 0.0
         noise = v_own + later + 0.5 * (_within(a, a, weight) + _within(b, b, weight)) / share
         counts = tiles.counts(noise, work + gather, each)
-        return _Plan(tiles, use, share, paths, widths, counts, error, found.aim)
+        return _Plan(tiles, use, each, share, paths, widths, counts, error, pass_, found.aim)
 
     def survey(self, errors, map_, points) -> Survey:
         share, widths = (
@@ -401,6 +419,7 @@ class _Plan:
         return Survey(
             self.use,
             errors,
+            self.each,
             share,
             self.light_paths,
             self.counts,
