@@ -45,7 +45,6 @@ class OwenSobol:
     def __init__(self, props):
         mi.Sampler.__init__(self, props)
         self._props = mi.Properties(props)
-        self._count = int(props.get("sample_count", 4))
         self._base_seed = int(props.get("seed", 0))
         self._per_wavefront = 0  # as many as sample_count
         self._width = 0
@@ -57,7 +56,8 @@ class OwenSobol:
 
     def fork(self):
         made = type(self)(self._props)
-        made._count, made._per_wavefront = self._count, self._per_wavefront
+        made.set_sample_count(self.sample_count())
+        made._per_wavefront = self._per_wavefront
         return made
 
     def clone(self):
@@ -66,12 +66,6 @@ class OwenSobol:
         made.index, made.random = mi.UInt32(self.index), mi.UInt32(self.random)
         made.dimension = mi.UInt32(self.dimension)
         return made
-
-    def sample_count(self):
-        return self._count
-
-    def set_sample_count(self, spp):
-        self._count = int(spp)
 
     def set_samples_per_wavefront(self, spp):
         self._per_wavefront = int(spp)
@@ -119,7 +113,7 @@ class OwenSobol:
     @property
     def _each(self) -> int:
         """Samples of a pixel in a wavefront. Mitsuba's integrators take all without telling."""
-        return self._per_wavefront or self._count
+        return self._per_wavefront or self.sample_count()
 
     def _next(self):
         """Three random numbers of pixel and dimension."""
@@ -128,7 +122,7 @@ class OwenSobol:
         return a, b, a ^ (b * 0x9E3779B9 + 0x7F4A7C15)
 
     def to_string(self):
-        return f"OwenSobolSampler[\n  sample_count = {self._count}\n]"
+        return f"OwenSobolSampler[\n  sample_count = {self.sample_count()}\n]"
 
 
 def _scrambled(x, seed):

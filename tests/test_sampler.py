@@ -85,3 +85,19 @@ def test_path_renders_with_it(variants_all, spp):
     # Spectral noise of wavelengths remains.
     factor = 0.9 if mi.is_spectral else 0.6
     assert ours.var(0, ddof=1).mean() < factor * plain.var(0, ddof=1).mean()
+
+
+def test_samples_asked_for_are_taken(variant_llvm_rgb, monkeypatch):
+    """``mi.render(spp=…)`` is more than the sampler was made for, or less."""
+    from rooms import room
+
+    definition = room(size=16)
+    definition["sensor"]["sampler"] = {"type": "owen_sobol", "sample_count": 8}
+    scene = mi.load_dict(definition)
+    kind, sizes = type(scene.sensors()[0].sampler()), []
+    seed = kind.seed
+    monkeypatch.setattr(kind, "seed", lambda self, *a: sizes.append(a[-1]) or seed(self, *a))
+    for spp in (32, 8, 5):
+        mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=spp)
+    assert [size for size in sizes if size != 1] == [32 * 256, 8 * 256, 5 * 256]
+    assert scene.sensors()[0].sampler().sample_count() == 5
