@@ -261,7 +261,7 @@ def probe_surface(scene, seed: int, points: GatherPoints, kernel: PlaneKernel, r
         q = points.p + kernel.s * (rho * cos_phi) + kernel.t * (rho * sin_phi)
         probe = mi.Ray3f(q + n * height, -n)
         probe.maxt = 2 * height
-        si = scene.ray_intersect(probe, mi.RayFlags.Minimal, False, probing)
+        si = scene.ray_intersect(probe, mi.RayFlags.Minimal, True, probing)
         on_surface = si.is_valid()
         on_surface &= dr.abs(dr.dot(si.n, n)) > NORMAL_COS
         landed |= probing & on_surface

@@ -283,7 +283,7 @@ def _walk(scene, sampler, ray, options, push, see):
 
     while dr.hint(active, label="eye paths"):
         # --- Find the next vertex ---
-        si = scene.ray_intersect(ray, active)
+        si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 1, active)
         if dr.hint(o.hide_emitters, mode="scalar"):
             si, ray = _skip_emitters(scene, ray, si, active & (depth == 1))
 
