@@ -21,7 +21,7 @@ import numpy as np
 from .arrays import own
 
 # Samples of a pixel as multiples of the mean: the fewest and the most.
-LEAST, MOST = 0.25, 4.0
+LEAST, MOST = 0.25, 8.0
 
 
 @dataclass(frozen=True)

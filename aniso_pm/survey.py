@@ -53,10 +53,11 @@ import mitsuba as mi
 import numpy as np
 
 from . import aim, arrays, eye, footprint, photons
+from .allotment import LEAST
 from .film import noise_share, rays_through, wavelengths
 from .prepared import PILOT, Prepared, stream_seed
 from .spectra import channel_mean
-from .tiles import SAMPLES, Tiles, smooth
+from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
 
 # Widths of kernels that are compared, and the range of those that are chosen, in pixels.
 _NARROW, _WIDE = 4.0, 8.0
@@ -124,7 +125,7 @@ def look(
     maps         two independent photon maps of as many light paths, or empty ones.
     light_paths  of a pass if they are given, else 0 or None.
     """
-    tiles = Tiles.of(sensor)
+    tiles = Tiles.of(sensor, COARSE)
     seen = _trace(scene, sensor, tiles, seed)
     read = partial(_read, scene, sensor, radius, seed, tiles)
     filtered = noise_share(sensor.film())
@@ -137,14 +138,15 @@ def look(
             use = "none" if scene.photons_are_dispensable else "caustic"
         light = seen.own + seen.later + (0 if use == "caustic" else seen.caustic)
         weight = tiles.weight(light)
-        return decide(use, weight, _within(light, light, weight)).survey({}, None, None)
+        plan = decide(use, weight, _within(light, light, weight))
+        return plan.survey({}, _counts(plan, scene, sensor, seed), None, None)
     own = seen.own
     weigh = lambda gathered: tiles.weight(own + gathered)  # noqa: E731
     if scene.use != "survey":
         found = read(maps, seen.points, weigh)
         weight = weigh(found.light)
         plan = decide(scene.use, weight, _within(own, own, weight), found)
-        return plan.survey({}, maps[0], seen.points)
+        return plan.survey({}, _counts(plan, scene, sensor, seed), maps[0], seen.points)
 
     # --- The global map ---
     first = eye.take(seen.points, dr.compress(~seen.points.caustic))
@@ -176,7 +178,35 @@ def look(
                 errors["none"] = plan.error
                 if plan.error < limit:
                     best, chosen = plan, (None, None)
-    return best.survey(errors, *chosen)
+    return best.survey(errors, _counts(best, scene, sensor, seed), *chosen)
+
+
+def _counts(plan: _Plan, scene: Prepared, sensor, seed: int) -> np.ndarray | None:
+    """Samples of each pixel: where they differ most is a matter of a few pixels, so that many eye
+    paths look, and nothing is gathered."""
+    if plan.each * LEAST < 1:
+        return None
+    fine, coarse = Tiles.of(sensor, FINE), plan.tiles
+    sampler, ray, lane = _pairs(sensor, fine, seed, 5)
+    # Kernels as those of the passes, which leave gather points.
+    scene = replace(scene, chosen=plan.use, footprint=footprint.of(sensor, 1.0))
+    few = dr.full(mi.Float, _LEAST_SHARE, fine.lanes)
+    thinning = eye.Thinning.of(few, seed, lane, lane) if plan.share.min() < 1 else None
+    L, _, _ = scene.trace(sampler, ray, thinning=thinning)
+    own = _pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
+    weight = fine.weight(own + coarse.refined(plan.gathered, fine)[:, None])
+    noise = _STRATIFIED * _within(own, own, weight) + coarse.refined(plan.noise, fine)
+    work = coarse.refined(smooth(coarse.grid(plan.path_work)).ravel(), fine)
+    return fine.counts(noise, work, plan.each)
+
+
+def _pairs(sensor, tiles: Tiles, seed: int, stream: int):
+    """(sampler, rays, lanes) of the pairs of all tiles."""
+    sampler = mi.load_dict({"type": "owen_sobol"})
+    lane = dr.arange(mi.UInt32, tiles.lanes)
+    sampler.begin(stream_seed(seed, PILOT, stream), lane // SAMPLES, lane % SAMPLES)
+    ray, _ = rays_through(sensor, sampler, tiles.positions(sensor, seed, sampler), 0.5)
+    return sampler, ray, lane
 
 
 @dataclass(frozen=True)
@@ -199,10 +229,7 @@ class _Seen:
 
 
 def _trace(scene: Prepared, sensor, tiles: Tiles, seed: int) -> _Seen:
-    sampler = mi.load_dict({"type": "owen_sobol"})
-    lane = dr.arange(mi.UInt32, tiles.lanes)
-    sampler.begin(stream_seed(seed, PILOT, 3), lane // SAMPLES, lane % SAMPLES)
-    ray, _ = rays_through(sensor, sampler, tiles.positions(sensor, seed, sampler), 0.5)
+    sampler, ray, _ = _pairs(sensor, tiles, seed, 3)
     scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
     vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
 
@@ -298,7 +325,8 @@ def _has_found(caustic, light, weight) -> bool:
 @dataclass(frozen=True)
 class _Plan:
     """The best that can be done with a use of the map; see the module's head and ``Survey``. share
-    and widths are those of tiles, error is the relative MSE, work that of a pass."""
+    and widths are those of tiles, error is the relative MSE, work that of a pass; path_work (of an
+    eye path), gathered (light) and noise (variance of gathers) are those of pairs."""
 
     tiles: Tiles
     use: str
@@ -306,9 +334,11 @@ class _Plan:
     share: np.ndarray
     light_paths: float
     widths: np.ndarray
-    counts: np.ndarray | None
     error: float
     work: float
+    path_work: np.ndarray
+    gathered: np.ndarray
+    noise: np.ndarray
     aim: aim.Learned | None = None
 
     @staticmethod
@@ -350,9 +380,11 @@ class _Plan:
         if found is None:
             pass_ = each * tiles.pixels * float(work.mean())
             error = v_eye / each * pass_ / total
-            counts = tiles.counts(v_own + later, work, each)
             share = np.full(1, 1.0 if use == "none" else _LEAST_SHARE)
-            return _Plan(tiles, use, each, share, 0.0, np.ones(1), counts, error, pass_)
+            nothing = np.zeros(len(whole))
+            return _Plan(
+                tiles, use, each, share, 0.0, np.ones(1), error, pass_, work, nothing, nothing
+            )
 
         # --- Variances and bias² of each pair, relative to the light there ---
         a, b, emitted = found.a, found.b, found.emitted
@@ -407,11 +439,23 @@ class _Plan:
         pass_ = each * tiles.pixels * (eye_work + gather) + paths * light
         error = (eye_noise / each + by_photons / paths) * pass_ / total
         error += _bias2(float(np.mean(change * (widths / _NARROW) ** 3))) if choose else 0.0
-        noise = v_own + later + 0.5 * (_within(a, a, weight) + _within(b, b, weight)) / share
-        counts = tiles.counts(noise, work + gather, each)
-        return _Plan(tiles, use, each, share, paths, widths, counts, error, pass_, found.aim)
+        noise = (v_gather + v_alone * thinner) / (filtered * share)
+        return _Plan(
+            tiles,
+            use,
+            each,
+            share,
+            paths,
+            widths,
+            error,
+            pass_,
+            work + gather,
+            found.light.mean(1),
+            noise,
+            found.aim,
+        )
 
-    def survey(self, errors, map_, points) -> Survey:
+    def survey(self, errors, counts, map_, points) -> Survey:
         share, widths = (
             self.tiles.to_pixels(self.tiles.grid(v)) if v.size > 1 else v
             for v in (self.share, self.widths)
@@ -422,7 +466,7 @@ class _Plan:
             self.each,
             share,
             self.light_paths,
-            self.counts,
+            counts,
             widths,
             self.aim,
             map_,

@@ -14,12 +14,13 @@ from .allotment import LEAST, MOST, in_proportion
 from .film import sampled_size
 from .prepared import PILOT, stream_seed
 
-# Tiles of the picture at most, and stratified samples of each half of the pair in a tile's pixel.
-_TILES, SAMPLES = 4096, 4
+# Tiles of a picture at most: those that read the photon map, and those that see what eye paths
+# find by themselves; stratified samples of each half of the pair in a tile's pixel.
+COARSE, FINE, SAMPLES = 4096, 20_000, 4
 # A tile's numbers count by so much, the rest is the picture's mean.
 _TRUST = 0.85
 # Uneven samples have to promise so much less work for the same error: they are a tenth slower.
-_WORTH = 1.15
+_WORTH = 1.1
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,9 @@ class Tiles:
     height: int
 
     @staticmethod
-    def of(sensor) -> Tiles:
+    def of(sensor, most: int) -> Tiles:
         width, height = sampled_size(sensor.film())
-        return Tiles(max(1, math.ceil(math.sqrt(width * height / _TILES))), width, height)
+        return Tiles(max(1, math.ceil(math.sqrt(width * height / most))), width, height)
 
     @property
     def across(self) -> int:
@@ -69,7 +70,7 @@ class Tiles:
 
     def weight(self, light) -> np.ndarray:
         """1/(mean² + floor²) of each pair, the floor a quarter of the median."""
-        level = smooth(self.grid(light.mean(1)))
+        level = smooth(self.grid(light.mean(-1)))
         lit = level[level > 0]
         floor = 0.25 * float(np.median(lit)) if lit.size else 1.0
         return (1 / (level**2 + floor**2)).ravel()
@@ -77,20 +78,20 @@ class Tiles:
     def counts(self, noise, work, each: int) -> np.ndarray | None:
         """Samples of each pixel, in proportion to √(variance/work), from those of pairs; None where
         even ones are as good: rare bright samples say little about where the next ones will be."""
-        noise, work = self.grid(noise), smooth(self.grid(work))
+        noise, work = self.grid(noise), self.grid(work)
         if not noise.mean() > 0:
             return None
         # What every other tile says, tried on the tiles between them.
         chess = np.indices(noise.shape).sum(0) % 2
         gains = []
         for known in (chess, 1 - chess):
-            share = _allotted(smooth(noise * known) / smooth(1.0 * known), work)
+            share = _allotted(smooth(noise * known, 3) / smooth(1.0 * known, 3), work)
             tried = known == 0
             cost = (noise / share)[tried].mean() * (work * share).mean()
             gains.append(noise[tried].mean() * work.mean() / cost)
         if not np.mean(gains) > _WORTH:
             return None
-        return in_proportion(self.to_pixels(_allotted(smooth(noise), work)), each)
+        return in_proportion(self.to_pixels(_allotted(smooth(noise, 3), work)), each)
 
     def trusted(self, noise) -> np.ndarray:
         """Variance of each tile, from those of pairs, which may be negative."""
@@ -100,6 +101,12 @@ class Tiles:
         """Half a standard error of smoothed means of pairs, in each tile."""
         squared = smooth(self.grid(pairs**2))
         return 0.5 * np.sqrt(squared * _SQUARED_WEIGHTS)
+
+    def refined(self, pairs, finer: Tiles) -> np.ndarray:
+        """Values of pairs for the tiles of ``finer``, which are smaller."""
+        row = np.arange(finer.down) * finer.edge // self.edge
+        column = np.arange(finer.across) * finer.edge // self.edge
+        return self.grid(pairs)[np.ix_(row, column)].ravel()
 
     def to_pixels(self, tiles) -> np.ndarray:
         pixels = np.kron(tiles, np.ones((self.edge, self.edge)))
@@ -121,9 +128,9 @@ _BINOMIAL = np.array([1, 4, 6, 4, 1]) / 16
 _SQUARED_WEIGHTS = float((_BINOMIAL**2).sum() ** 2)
 
 
-def smooth(tiles: np.ndarray) -> np.ndarray:
-    """Binomial averages over 5 × 5 tiles."""
-    for axis in (0, 1):
+def smooth(tiles: np.ndarray, times: int = 1) -> np.ndarray:
+    """Binomial averages over 5 × 5 tiles: a standard deviation of √times tiles."""
+    for axis in times * (0, 1):
         pad = [(2, 2) if k == axis else (0, 0) for k in (0, 1)]
         windows = np.lib.stride_tricks.sliding_window_view(np.pad(tiles, pad, "edge"), 5, axis)
         tiles = windows @ _BINOMIAL
