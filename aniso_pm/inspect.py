@@ -26,17 +26,18 @@ class Finding:
     evidence: list[str]
 
 
-def examine(scene: Prepared) -> list[Finding]:
-    """All decisions that were taken for a scene and its integrator's parameters. Where the use of
-    the map is open a pilot is traced through the scene's first sensor, as before a rendering."""
-    scene, why_map = decided(scene)
+def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
+    """All decisions that were taken for a scene and its integrator's parameters. Where there is a
+    map a pilot is traced through the scene's first sensor, as before a rendering. compile_: say
+    what is compiled, too."""
+    scene, why_map, why_aim = decided(scene)
     needs, settings = scene.needs, scene.settings
     shown = scene.follow_lobes
     why_disc = "parameter kernel=isotropic" if settings.kernel == "isotropic" else "none found"
     mirrors = [e for e in needs.chains if e not in needs.general] or needs.chains
     emitters = [emitter_name(e) for e in scene.scene.emitters()]
     spectrum = f"{dr.size_v(mi.Spectrum)} channels of the variant {mi.variant()}"
-    return [
+    findings = [
         Finding(
             "photon map",
             scene.needs_map,
@@ -95,6 +96,14 @@ def examine(scene: Prepared) -> list[Finding]:
         ),
         _environment(scene),
         Finding(
+            "aimed light paths",
+            scene.aim is not None,
+            "light paths begin where they show"
+            if scene.aim
+            else "light paths begin evenly over what emitters emit",
+            [why_aim],
+        ),
+        Finding(
             "path length of photons",
             scene.gather_depth > 0,
             "tested at every gather"
@@ -123,6 +132,7 @@ def examine(scene: Prepared) -> list[Finding]:
             [spectrum],
         ),
     ]
+    return [*findings, kernels(scene)] if compile_ else findings
 
 
 def _environment(scene: Prepared) -> Finding:
@@ -142,7 +152,6 @@ def _environment(scene: Prepared) -> Finding:
 
 def kernels(scene: Prepared) -> Finding:
     """What is compiled for each stage, found by a tiny pass with the scene's first sensor."""
-    scene, _ = decided(scene)
     radius = dr.opaque(mi.Float, scene.settings.initial_radius or 0.01 * scene.extent)
     rays = camera_rays(scene.scene.sensors()[0], 0)
     sampler = mi.load_dict({"type": "independent"})
@@ -166,18 +175,31 @@ def kernels(scene: Prepared) -> Finding:
     return Finding("kernels", True, f"{number} kernels, {operations:,} operations", evidence)
 
 
-def decided(scene: Prepared) -> tuple[Prepared, list[str]]:
-    """The scene with the use of its map, and what ``map=auto`` went by."""
-    needs, settings = scene.needs, scene.settings
-    if settings.map != "auto":
-        return scene, []
-    if not scene.undecided:
-        causes = [f"light of {e}" for e in needs.unseen] or ["nothing casts caustics"]
-        return scene, [f"map=auto: {causes[0]}"]
+def decided(scene: Prepared) -> tuple[Prepared, list[str], str]:
+    """The scene as a pilot has decided, what ``map=auto`` went by, and why light paths are aimed
+    or not."""
+    if not scene.needs_map:
+        causes = ["nothing casts caustics"] if scene.settings.map == "auto" else []
+        return scene, [f"map=auto: {cause}" for cause in causes], "there are no light paths"
     sensor = scene.scene.sensors()[0]
     spp, pixels = sensor.sampler().sample_count(), pixel_count(sensor.film())
-    found = settle(scene, sensor, 0, shares(settings, spp, pixels).each)
-    return replace(scene, chosen=found.use), [f"map=auto: {as_promises(found.errors)}"]
+    found = settle(scene, sensor, 0, shares(scene.settings, spp, pixels).each)
+    why = []
+    if scene.undecided:
+        why = [f"map=auto: {as_promises(found.errors)}"]
+    elif scene.settings.map == "auto" and scene.needs.unseen:
+        why = [f"map=auto: light of {emitter}" for emitter in scene.needs.unseen[:1]]
+    count = scene.settings.photon_count
+    return found.applied(scene).with_(photon_count=count), why, _aimed(found.aim)
+
+
+def _aimed(found) -> str:
+    if found is None:
+        return "a pilot found too little to gain"
+    return (
+        f"{len(found.low)} parts of what is emitted: a light path has {found.variance:.2f} of the "
+        f"variance and {found.work:.2f} of the work of an even one"
+    )
 
 
 def as_promises(errors: dict[str, float | None]) -> str:

@@ -171,10 +171,11 @@ class AnisoPhotonMapper:
 
     Eye paths take their random numbers from an ``owen_sobol`` sequence that goes on from pass to
     pass, whatever the sampler of the scene, which says only how many samples there are. That number
-    is a mean: pixels in which a pilot finds more noise for the work get up to four times as many,
+    is a mean: pixels in which a pilot finds more noise for the work get up to eight times as many,
     others as few as a quarter, with weights that make up for it. Some of the eye paths of a pixel
     read the photon map for all of them, as many as the pilot finds worth their time
-    (``statistics["share_of_gathers"]``).
+    (``statistics["share_of_gathers"]``). Light paths begin where the pilot has seen them matter,
+    also with weights (``statistics["aim"]``).
 
     Before ``render()`` these attributes may be set: ``progress``, a function (done, total, text)
     that is called after each wavefront (see ``aniso_pm.progress.bar``); ``callback``, a function

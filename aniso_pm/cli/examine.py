@@ -43,7 +43,7 @@ def inspect(
         settings = getattr(integrator, "settings", None) or Settings()
         try:
             prepared = prepare(world, settings, False)
-            findings = [*inspection.examine(prepared), inspection.kernels(prepared)]
+            findings = inspection.examine(prepared, compile_=True)
         except ValueError as error:
             raise InputError(one_line(error)) from error
     if as_json:
