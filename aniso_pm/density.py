@@ -6,7 +6,7 @@ With M light paths and photons of flux Φ_j at offsets d_j, the irradiance at p1
 
 and the reflected radiance is E times the BRDF of p1; on receivers that are not Lambertian every
 photon brings its own direction, and the BRDF goes into the sum. Photons count only if they lie on
-the same surface: |d·n| within half a bandwidth and normals within 41 degrees (cosine 0.75).
+the same surface: |d·n| within half a bandwidth (or less, see ``Prepared.thickness``) and normals within 41 degrees (cosine 0.75).
 
 m is the share of the kernel that lies on such a surface. Without it every estimate near an edge
 loses what its kernel spills over the edge. Points drawn from the kernel are probed by short rays
@@ -118,7 +118,7 @@ def estimate(
     photons: PhotonMap,
     points: GatherPoints,
     kernel: PlaneKernel,
-    radius,
+    thickness,
     max_depth,
     active,
     surface=None,
@@ -128,6 +128,7 @@ def estimate(
     """(reflected radiance, photons inside the kernel) of each gather point, edges not yet
     compensated.
 
+    thickness  of what counts as the same surface: bandwidth, or less, world units.
     max_depth  path segments of camera and light path together, or 0 for no limit (or none that
                the map does not already keep).
     surface    Surface of receivers that are not Lambertian.
@@ -135,7 +136,7 @@ def estimate(
     scores     None, or (column, weight): what each photon gives to each point, squared, times the
                point's weight, is added to the photon's entry in the column.
     """
-    ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
+    ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * thickness)
     counts = _filter(points, max_depth)
 
     def visit(total, slot, word, rho2, inside):
@@ -195,13 +196,13 @@ def _filter(points: GatherPoints, max_depth):
 
 
 def photons_inside(
-    photons: PhotonMap, points: GatherPoints, kernel: PlaneKernel, radius, max_depth
+    photons: PhotonMap, points: GatherPoints, kernel: PlaneKernel, thickness, max_depth
 ):
     """Is the photon in each slot of the map one that :func:`estimate` sums up?  (one gather point)
 
     Returns mi.Bool, as wide as there are photons.
     """
-    ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * radius)
+    ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * thickness)
     counts = _filter(points, max_depth)
     found = dr.zeros(mi.Bool, photons.stored)
 
@@ -239,14 +240,14 @@ class Surface:
 
 
 @dr.syntax
-def probe_surface(scene, seed: int, points: GatherPoints, kernel: PlaneKernel, radius, active):
+def probe_surface(scene, seed: int, points: GatherPoints, kernel: PlaneKernel, thickness, active):
     """(1/m, nothing found?): the inverse share of each kernel that lies on the surface.
 
     1 where none of PROBES_MAX points lay on one, which says more about the surface (finer than
     the slab, or than the resolution of its coordinates) than about its edges.
     """
     n = mi.Vector3f(points.n)
-    height = SLAB * radius
+    height = SLAB * thickness
     # Random numbers of the eye path and vertex, whatever the order of the points.
     state, sequence = mi.sample_tea_32(points.lane, points.depth + dr.opaque(mi.UInt32, seed))
     random = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))

@@ -4,7 +4,7 @@ With f the footprint of a pixel at a gather point (world units, its width there,
 path), w the width of the kernel in pixels (``survey`` finds it pixel by pixel), and r_i the
 bandwidth of pass i (0-based, see ``schedule``), the kernel's radius is
 
-    r(p) = clip(w f r_i/r_0, l_i r_i, r_i),      l_i = 1/max(4, i + 1).
+    r(p) = clip(w f r_i/r_0, l_i r_i, 4 r_i),      l_i = 1/max(4, i + 1).
 
 Everything shrinks from pass to pass, so that the mean over passes converges as with one radius; r_i
 and l_i are functions of i alone, however many passes there will be: passes that were rendered apart
@@ -13,6 +13,7 @@ add up.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,8 +23,11 @@ import numpy as np
 
 from .arrays import own
 
-# Kernels of the first passes may be narrower than the bandwidth by so much.
-_LEAST = 4
+# Widest kernels, in pixels, that pilots have tried (see ``survey``).
+TRIED = 8.0
+# Kernels of the first passes may be narrower than the bandwidth by so much, kernels of all passes
+# wider.
+_LEAST, _MOST = 4, 4
 
 
 @dataclass  # not frozen: Dr.Jit traverses it
@@ -43,13 +47,14 @@ class Footprint:
     widths: Any
     pixel: Any = None
 
-    def share(self, distance, lane):
+    def share(self, distance, lane, widest=math.inf):
         """Of a gather point of eye path ``lane``, ``distance`` world units of path from the
-        camera."""
+        camera. widest: that a kernel shall be, in pixels."""
         width = self.widths
         if self.pixel is not None:
             width = dr.gather(mi.Float, width, dr.gather(mi.UInt32, self.pixel, lane))
-        return dr.clip(width * dr.fma(self.spread, distance, self.start), self.least, 1)
+        width = dr.minimum(width, widest)
+        return dr.clip(width * dr.fma(self.spread, distance, self.start), self.least, _MOST)
 
     def in_pass(self, index: int) -> Footprint:
         """The same in pass ``index`` (0-based)."""

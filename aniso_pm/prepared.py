@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from . import density, emission, eye, photons, summed
 from .aim import Aim
-from .footprint import Footprint
+from .footprint import TRIED, Footprint
 from .needs import Needs, read_scene
 from .settings import Settings
 
@@ -270,16 +270,24 @@ class Prepared:
             return radius
         return radius * self.footprint.share(points.distance, points.lane)
 
+    def thickness(self, points: eye.GatherPoints, radius):
+        """Bandwidth by which photons are on the same surface (``density.SLAB``): that of kernels
+        as wide as pilots try them, where they are wider. Farther off lies who knows what."""
+        if self.footprint is None:
+            return radius
+        return radius * self.footprint.share(points.distance, points.lane, TRIED)
+
     def _gather(self, map_, radius, seed, points, surface, scores) -> density.Gathered:
         if scores is not None:
             scores = scores[0], dr.gather(mi.Float, scores[1], points.lane)
+        thickness = self.thickness(points, radius)
         radius = self.bandwidth(points, radius)
         kernel, follows, degenerate = density.kernels(points, radius, self.kernel_options)
         L, count = density.estimate(
             map_,
             points,
             kernel,
-            radius,
+            thickness,
             self.gather_depth,
             mi.Bool(True),
             surface,
@@ -289,7 +297,7 @@ class Prepared:
         lost = mi.Bool(False)
         if self.settings.edge_compensation:
             inverse, lost = density.probe_surface(
-                self.scene, seed, points, kernel, radius, count > 0
+                self.scene, seed, points, kernel, thickness, count > 0
             )
             L *= inverse
         clamped, capped = follows & kernel.clamped, follows & kernel.capped

@@ -60,7 +60,7 @@ from .spectra import channel_mean
 from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
 
 # Widths of kernels that are compared, and the range of those that are chosen, in pixels.
-_NARROW, _WIDE = 4.0, 8.0
+_NARROW, _WIDE = 0.5 * footprint.TRIED, footprint.TRIED
 _THINNEST, _WIDEST = 1.0, 32.0
 # Passes that the widths are right for, however many there will be: passes add up.
 _PASSES = 32

@@ -142,6 +142,7 @@ def explain(
         path = vertices.path(sample, scene, ())
         return replace(found, sentence=f"eye path {sample} reads no photon map", path=path)
     point = eye.take(points, mi.UInt32(chosen))
+    thickness = float(dr.mean(prepared.thickness(point, mi.Float(radius)))[0])
     radius = float(dr.mean(prepared.bandwidth(point, mi.Float(radius)))[0])
     found = replace(found, radius=radius)
     kernel, lobe, outlines = _kernel(prepared, point, radius, bool(lost[chosen]))
@@ -155,7 +156,7 @@ def explain(
         kernel=kernel,
         photons_inside=int(inside[chosen]),
         contribution=tuple(map(float, radiance[chosen])),
-        photons=_photons(prepared, map_, point, radius, outlines),
+        photons=_photons(prepared, map_, point, radius, thickness, outlines),
         outlines=outlines,
     )
 
@@ -340,11 +341,13 @@ def _in_lobe(lobe: Lobe, n, s, t):
     return np.stack([v @ np.array(lobe.x), v @ np.array(lobe.y)], axis=1)
 
 
-def _photons(prepared: Prepared, map_, point, radius: float, outlines) -> Photons:
+def _photons(
+    prepared: Prepared, map_, point, radius: float, thickness: float, outlines
+) -> Photons:
     """Photons in a window around the kernel."""
     plane, _, _ = density.kernels(point, mi.Float(radius), prepared.kernel_options)
     limit = prepared.gather_depth
-    counted = density.photons_inside(map_, point, plane, mi.Float(radius), limit).numpy()
+    counted = density.photons_inside(map_, point, plane, mi.Float(thickness), limit).numpy()
     at = dr.gather(mi.Vector4f, map_.index.points, dr.arange(mi.UInt32, map_.stored))
     d = mi.Vector3f(at.x, at.y, at.z) - mi.Vector3f(point.p)
     s, t, n = (np.array(_plain(v)) for v in (plane.s, plane.t, point.n))
@@ -353,7 +356,7 @@ def _photons(prepared: Prepared, map_, point, radius: float, outlines) -> Photon
     xy = np.stack([d @ s / long, d @ t / short], axis=1)
     word = dr.reinterpret_array(mi.UInt32, at.w)
     facing = photons.faces(word, mi.Vector3f(point.n)).numpy()
-    facing &= np.abs(d @ n) <= density.SLAB * radius
+    facing &= np.abs(d @ n) <= density.SLAB * thickness
 
     reach = 1.15 * density.CUT2**0.5 * long
     near = np.flatnonzero((np.abs(xy) <= reach).all(1) & (np.abs(d @ n) <= reach))
