@@ -10,10 +10,10 @@ errors relative: the path's part in the variance of the picture, as all photons 
 cube is halved again and again, each box across the number that gains most, and boxes get light
 paths in proportion to
 
-    p ∝ √(Σq Σc),        Σ over the pilot's paths in the box, c the work of a path,
+    p ∝ V √(Σq/Σc),
 
-which makes variance times work smallest (Cauchy and Schwarz: (Σ V²q/p)(Σ p c) with V the volume).
-A box is left whole where halving it would gain no more than chance does. A tenth of all paths stays
+V the volume, Σ over the pilot's paths in the box, c the work of a path: that makes variance times
+work, (Σ V²q̄/p)(Σ p c̄), smallest, and by Cauchy and Schwarz the smallest is (Σ √(Σq Σc))². A box is left whole where halving it would gain no more than chance does. A tenth of all paths stays
 spread evenly, so that no weight V/p is above ten: any p > 0 gives the right energy. Paths of a
 pass are stratified over the boxes.
 
@@ -35,7 +35,7 @@ from .arrays import own
 # Share of the light paths that stays spread evenly.
 _EVEN = 0.1
 # A box's score counts by so much, the rest is that of the box it was a half of.
-_TRUST = 0.9
+_TRUST = 0.97
 # Halvings of the cube, one after the other; paths in effect that a box to be halved holds.
 _HALVINGS, _ENOUGH = 14, 8
 # Gain of a halving: at least this share of all, and so much of what chance brings.
@@ -58,11 +58,12 @@ class Aim:
         box = self.choose.sample(u)
         even = (u1, u2.x, u2.y, u3.x, u3.y)
         below_one = 1 - 2.0**-24
+        own = lambda column: dr.gather(mi.Float, column, box)  # noqa: E731
         a, b, c, d, e = (
-            dr.minimum(dr.fma(v, dr.gather(mi.Float, s, box), dr.gather(mi.Float, o, box)), below_one)
-            for v, s, o in zip(even, self.size, self.low, strict=True)
+            dr.minimum(dr.fma(v, own(size), own(low)), below_one)
+            for v, size, low in zip(even, self.size, self.low, strict=True)
         )
-        return a, mi.Point2f(b, c), mi.Point2f(d, e), dr.gather(mi.Float, self.weight, box)
+        return a, mi.Point2f(b, c), mi.Point2f(d, e), own(self.weight)
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def learn(numbers: np.ndarray, score: np.ndarray, work: np.ndarray, photons) -> 
 def _chances(score, parent, work, volume):
     """Of boxes. parent: score that each would have if it were like the box it was a half of."""
     trusted = _TRUST * score / score.sum() + (1 - _TRUST) * parent / parent.sum()
-    root = np.sqrt(trusted * work)
+    root = volume * np.sqrt(trusted / np.maximum(work, 1e-12 * work.sum()))
     return (1 - _EVEN) * root / root.sum() + _EVEN * volume
 
 

@@ -6,14 +6,17 @@ With M light paths and photons of flux Φ_j at offsets d_j, the irradiance at p1
 
 and the reflected radiance is E times the BRDF of p1; on receivers that are not Lambertian every
 photon brings its own direction, and the BRDF goes into the sum. Photons count only if they lie on
-the same surface: |d·n| within half a bandwidth (or less, see ``Prepared.thickness``) and normals within 41 degrees (cosine 0.75).
+the same surface: |d·n| within half a bandwidth (or less, see ``Prepared.thickness``), normals
+within 41 degrees (cosine 0.75), and (n + n')·d within 5 % of |d|: on every quadric, flat or curved,
+it is 0, and between parallel sheets it is twice their distance.
 
 m is the share of the kernel that lies on such a surface. Without it every estimate near an edge
 loses what its kernel spills over the edge. Points drawn from the kernel are probed by short rays
-along −n until the first one lands; the number of rays is geometrically distributed
-with mean 1/m, so it *is* an estimate of 1/m, unbiased but for the end after PROBES_MAX rays, at the
-price of one ray wherever the kernel spills nothing. A surface that goes on behind a wall counts as
-well, and so does metal or glass that lies flat on it: there the estimate stays dark.
+along −n, through whatever covers the surface (glass that touches it), until the first one lands;
+the number of points is geometrically distributed with mean 1/m, so it *is* an estimate of 1/m,
+unbiased but for the end after PROBES_MAX points, at the price of one ray wherever the kernel spills
+nothing. A surface that goes on behind a wall counts as well, and so does one under metal that lies
+flat on it: there the estimate stays dark.
 """
 
 from __future__ import annotations
@@ -34,9 +37,11 @@ from .photons import (
     PhotonMap,
     faces,
     is_caustic,
+    one_sheet,
     photon_direction,
     photon_flux,
     segments,
+    smooth_between,
 )
 from .receivers import gathered_part
 from .spectra import channel_mean
@@ -45,7 +50,7 @@ CUT2 = 4.0
 KERNEL_MASS = 1 - math.exp(-CUT2)
 # A photon on the same surface: offset along the normal in bandwidths.
 SLAB = 0.5
-# Rays after which the probe gives up: 1/m is taken to be at most this.
+# Points after which the probe gives up: 1/m is taken to be at most this.
 PROBES_MAX = 12
 
 
@@ -139,9 +144,9 @@ def estimate(
     ellipses = spatial.Ellipses.from_axes(points.p, kernel.s, kernel.t, points.n, SLAB * thickness)
     counts = _filter(points, max_depth)
 
-    def visit(total, slot, word, rho2, inside):
+    def visit(total, slot, word, d, rho2, inside):
         reflected, missing, count = total
-        inside &= counts(word)
+        inside &= counts(word, d)
         light = photon_flux(photons, slot, inside) * dr.select(inside, dr.exp(-rho2), 0)
         if surface is not None:
             light *= surface.brdf(photon_direction(photons, slot, inside), inside)
@@ -179,13 +184,13 @@ def estimate(
 
 
 def _filter(points: GatherPoints, max_depth):
-    """A function of a photon's word: does the photon count at these gather points, if it is inside
-    the kernel and the cosine of normals is above ``least``?"""
-    n = mi.Vector3f(points.n)
+    """A function of a photon's word and offset: does the photon count at these gather points, if it
+    is inside the kernel and the cosine of normals is above ``least``?"""
+    n, rounding = mi.Vector3f(points.n), _rounding(points.p)
     allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
 
-    def counts(word, least=NORMAL_COS):
-        yes = faces(word, n, least)
+    def counts(word, d, least=NORMAL_COS):
+        yes = faces(word, n, least) & one_sheet(word, n, d, rounding)
         if max_depth:
             yes &= segments(word) <= allowed
         if points.caustic is not None:
@@ -193,6 +198,17 @@ def _filter(points: GatherPoints, max_depth):
         return yes
 
     return counts
+
+
+def same_surface(points: GatherPoints, word, d):
+    """Does the photon at the offset d lie on the surface of a point, the slab left aside?"""
+    n = mi.Vector3f(points.n)
+    return faces(word, n) & one_sheet(word, n, d, _rounding(points.p))
+
+
+def _rounding(p):
+    """By how much offsets between points near p may be wrong, world units."""
+    return 2e-6 * dr.maximum(dr.maximum(dr.abs(p.x), dr.abs(p.y)), dr.abs(p.z))
 
 
 def photons_inside(
@@ -206,8 +222,8 @@ def photons_inside(
     counts = _filter(points, max_depth)
     found = dr.zeros(mi.Bool, photons.stored)
 
-    def visit(total, slot, word, rho2, inside):
-        dr.scatter(found, mi.Bool(True), slot, inside & counts(word))
+    def visit(total, slot, word, d, rho2, inside):
+        dr.scatter(found, mi.Bool(True), slot, inside & counts(word, d))
         return total
 
     spatial.gather(photons.index, ellipses, CUT2, visit, mi.UInt32(0), mi.Bool(True))
@@ -247,24 +263,30 @@ def probe_surface(scene, seed: int, points: GatherPoints, kernel: PlaneKernel, t
     the slab, or than the resolution of its coordinates) than about its edges.
     """
     n = mi.Vector3f(points.n)
-    height = SLAB * thickness
+    height, rounding = SLAB * thickness, _rounding(points.p)
     # Random numbers of the eye path and vertex, whatever the order of the points.
     state, sequence = mi.sample_tea_32(points.lane, points.depth + dr.opaque(mi.UInt32, seed))
     random = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
     tries = mi.UInt32(0)
     landed = mi.Bool(False)
-    probing = mi.Bool(active)
+    probing, fresh = mi.Bool(active), mi.Bool(True)
+    q, depth = mi.Point3f(points.p), mi.Float(0)  # point of the kernel; below the slab's top
     while probing:
-        tries += 1
         u = mi.Point2f(random.next_float32(), random.next_float32())
         sin_phi, cos_phi = dr.sincos(dr.two_pi * u.y)
         rho = dr.sqrt(-dr.log(1 - u.x * KERNEL_MASS))
-        q = points.p + kernel.s * (rho * cos_phi) + kernel.t * (rho * sin_phi)
-        probe = mi.Ray3f(q + n * height, -n)
-        probe.maxt = 2 * height
+        drawn = points.p + kernel.s * (rho * cos_phi) + kernel.t * (rho * sin_phi)
+        q, depth = dr.select(fresh, drawn, q), dr.select(fresh, 0, depth)
+        tries += dr.select(fresh, mi.UInt32(1), 0)
+        probe = mi.Ray3f(q + n * (height - depth), -n)
+        probe.maxt = 2 * height - depth
         si = scene.ray_intersect(probe, mi.RayFlags.Minimal, True, probing)
-        on_surface = si.is_valid()
-        on_surface &= dr.abs(dr.dot(si.n, n)) > NORMAL_COS
+        cosine, d = dr.dot(si.n, n), si.p - points.p
+        on_surface = si.is_valid() & (dr.abs(cosine) > NORMAL_COS)
+        on_surface &= smooth_between(n, dr.mulsign(mi.Vector3f(si.n), cosine), d, rounding)
         landed |= probing & on_surface
-        probing &= ~on_surface & (tries < PROBES_MAX)
+        # What only covers the surface, glass that touches it for example, is passed.
+        depth += si.t + 1e-3 * height + rounding
+        fresh = ~si.is_valid() | (depth >= 2 * height)
+        probing &= ~on_surface & (~fresh | (tries < PROBES_MAX))
     return dr.select(landed, mi.Float(tries), 1), active & ~landed

@@ -249,9 +249,9 @@ def _spread(x):
 def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, whole=None):
     """Fold ``visit`` over all points inside each lane's ellipse.
 
-    visit(total, slot, word, rho2, inside) -> total is called with the slot of a point, its word,
-    ρ² = (a·d)² + (b·d)² and whether it is inside (it is not in slots without a point); ``total`` is
-    any tree of Dr.Jit arrays.
+    visit(total, slot, word, d, rho2, inside) -> total is called with the slot of a point, its word,
+    its offset d from the centre, ρ² = (a·d)² + (b·d)² and whether it is inside (it is not in slots
+    without a point); ``total`` is any tree of Dr.Jit arrays.
 
     whole  None, or (tolerance, rim, visit_node): nodes within the thickness of the cylinder whose
            half extents x, y in units of 1/|a|, 1/|b| have x² + y² <= tolerance (x² + y² + rim, if
@@ -313,6 +313,7 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, 
             da, db = dr.dot(a, d), dr.dot(b, d)
             rho2 = da * da + db * db
             inside = (rho2 <= cut2) & (dr.abs(dr.dot(c, d)) <= 1)
-            total = visit(total, slot, dr.reinterpret_array(mi.UInt32, point.w), rho2, inside)
+            word = dr.reinterpret_array(mi.UInt32, point.w)
+            total = visit(total, slot, word, d, rho2, inside)
             k += 1
     return total

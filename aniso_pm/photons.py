@@ -117,6 +117,8 @@ class Origins:
 EMPTY = PhotonMap(0, 0, 0, None, None, None, None)
 # Cosine between normals from which two points may lie on the same surface.
 NORMAL_COS = 0.75
+# Share of their distance by which they may miss a smooth surface through both.
+BEND = 0.05
 # Segments that the word can tell apart: this number stands for itself and more.
 SEGMENTS_MAX = 127
 
@@ -253,6 +255,18 @@ def faces(word, n, least=NORMAL_COS):
     v = _octahedral(word, 12)
     cosine = dr.dot(v, n)
     return (cosine > 0) & (dr.square(cosine) > least**2 * dr.squared_norm(v))
+
+
+def one_sheet(word, n, d, rounding):
+    """May a surface go smoothly from a point to the photon at the offset d from it? On quadrics
+    (n + n')·d = 0, for the photon's normal n'; between parallel sheets at the distance h it is 2h.
+    rounding: of offsets, world units."""
+    return smooth_between(n, _decode(word, 12), d, rounding)
+
+
+def smooth_between(n, other, d, rounding):
+    """The same for a normal that is known."""
+    return dr.abs(dr.dot(n + other, d)) <= BEND * dr.norm(d) + rounding
 
 
 def _encode(v, bits):

@@ -148,13 +148,13 @@ def _word(node: _Node):
 def weighed(sums: Sums, node, ellipses: Ellipses, cut2, counts, tolerance):
     """(flux times weight, centroid inside the ellipse?, may it be taken?) of a node.
 
-    counts(word, cosine)  does a photon count, if its normal is that near to the receiver's?
+    counts(word, d, cosine)  does a photon count, if its normal is that near to the receiver's?
     """
     place = dr.gather(mi.Vector4f, sums.place, node)
     d = mi.Vector3f(place.x, place.y, place.z) - ellipses.center
     a, b = dr.dot(ellipses.a, d), dr.dot(ellipses.b, d)
     rho2 = a * a + b * b
-    taken = dr.isfinite(rho2) & counts(dr.reinterpret_array(mi.UInt32, place.w), _COSINE)
+    taken = dr.isfinite(rho2) & counts(dr.reinterpret_array(mi.UInt32, place.w), d, _COSINE)
     # x² + y² <= tolerance/2 has been tested; the other half is for the colours.
     steep = dr.maximum(dr.squared_norm(ellipses.a), dr.squared_norm(ellipses.b))
     slack = dr.square(_STEEPEST * dr.gather(mi.Float, sums.spread, node)) * steep

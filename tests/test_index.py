@@ -36,7 +36,7 @@ def ellipses(rng, centers, size, aspect):
 def gathered(points, words, e):
     index, _ = spatial.build(to_points(points), mi.UInt32(words.astype(np.uint32)))
 
-    def visit(total, slot, word, rho2, inside):
+    def visit(total, slot, word, d, rho2, inside):
         count, weight, tag = total
         return (
             count + dr.select(inside, mi.UInt32(1), 0),
@@ -111,7 +111,7 @@ def test_inactive_lanes_do_nothing():
     e, _ = ellipses(np.random.default_rng(1), points[:8], 10.0, 1)
     active = mi.Bool([True, False] * 4)
 
-    def visit(total, slot, word, rho2, inside):
+    def visit(total, slot, word, d, rho2, inside):
         return total + dr.select(inside, mi.UInt32(1), 0)
 
     count = spatial.gather(index, e, CUT2, visit, dr.zeros(mi.UInt32, 8), active)

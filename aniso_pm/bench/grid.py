@@ -81,7 +81,8 @@ def gather(grid: Grid, ellipses: Ellipses, cut2: float, visit, total, rows: bool
             da, db = dr.dot(a, d), dr.dot(b, d)
             rho2 = da * da + db * db
             inside = (rho2 <= cut2) & (dr.abs(dr.dot(c, d)) <= 1)
-            total = visit(total, slot, dr.reinterpret_array(mi.UInt32, point.w), rho2, inside)
+            word = dr.reinterpret_array(mi.UInt32, point.w)
+            total = visit(total, slot, word, d, rho2, inside)
             slot += 1
         near += 1
     return total

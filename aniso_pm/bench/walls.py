@@ -112,7 +112,7 @@ def visitor(flux):
 
     flux: Float, 4 a photon. Returns (visit, total to start from)."""
 
-    def visit(total: Any, slot, word, rho2, inside):
+    def visit(total: Any, slot, word, d, rho2, inside):
         power, count = total
         packed = dr.gather(mi.Vector4f, flux, slot, inside)
         weight = dr.select(inside, dr.exp(-rho2), 0)

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import density, eye, film, footprint, photons
+from .. import density, eye, film, footprint
 from ..kernel import kernel_axes, project_to_plane
 from ..ndf import read_roughness
 from ..needs import describe
@@ -341,21 +341,19 @@ def _in_lobe(lobe: Lobe, n, s, t):
     return np.stack([v @ np.array(lobe.x), v @ np.array(lobe.y)], axis=1)
 
 
-def _photons(
-    prepared: Prepared, map_, point, radius: float, thickness: float, outlines
-) -> Photons:
+def _photons(prepared: Prepared, map_, point, radius: float, thickness: float, outlines) -> Photons:
     """Photons in a window around the kernel."""
     plane, _, _ = density.kernels(point, mi.Float(radius), prepared.kernel_options)
     limit = prepared.gather_depth
     counted = density.photons_inside(map_, point, plane, mi.Float(thickness), limit).numpy()
     at = dr.gather(mi.Vector4f, map_.index.points, dr.arange(mi.UInt32, map_.stored))
-    d = mi.Vector3f(at.x, at.y, at.z) - mi.Vector3f(point.p)
+    offset = mi.Vector3f(at.x, at.y, at.z) - mi.Vector3f(point.p)
     s, t, n = (np.array(_plain(v)) for v in (plane.s, plane.t, point.n))
-    d = np.array(d).T.astype(np.float64)
+    d = np.array(offset).T.astype(np.float64)
     long, short = np.linalg.norm(s), np.linalg.norm(t)
     xy = np.stack([d @ s / long, d @ t / short], axis=1)
     word = dr.reinterpret_array(mi.UInt32, at.w)
-    facing = photons.faces(word, mi.Vector3f(point.n)).numpy()
+    facing = density.same_surface(point, word, offset).numpy()
     facing &= np.abs(d @ n) <= density.SLAB * thickness
 
     reach = 1.15 * density.CUT2**0.5 * long

@@ -159,7 +159,7 @@ def _visits(position, at, radius) -> float:
         _points(at), disc.s, disc.t, mi.Normal3f(0, 0, 1), density.SLAB * radius
     )
 
-    def visit(total, slot, word, rho2, inside):
+    def visit(total, slot, word, d, rho2, inside):
         return total[0] + 1, total[1] + dr.select(inside, mi.UInt32(1), 0)
 
     tested, found = spatial.gather(
