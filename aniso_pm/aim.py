@@ -13,9 +13,10 @@ paths in proportion to
     p ∝ V √(Σq/Σc),
 
 V the volume, Σ over the pilot's paths in the box, c the work of a path: that makes variance times
-work, (Σ V²q̄/p)(Σ p c̄), smallest, and by Cauchy and Schwarz the smallest is (Σ √(Σq Σc))². A box is left whole where halving it would gain no more than chance does. A tenth of all paths stays
-spread evenly, so that no weight V/p is above ten: any p > 0 gives the right energy. Paths of a
-pass are stratified over the boxes.
+work, (Σ V²q̄/p)(Σ p c̄), smallest, and by Cauchy and Schwarz the smallest is (Σ √(Σq Σc))². A box
+is left whole where halving it would gain no more than chance does. A tenth of all paths stays
+spread evenly, so that no weight V/p is above ten: any p > 0 gives the right energy. Paths of a pass
+are stratified over the boxes.
 
 What was gained is judged by one half of the pilot where the other half has aimed; where that is
 too little, nothing is aimed.

@@ -139,14 +139,14 @@ def look(
         light = seen.own + seen.later + (0 if use == "caustic" else seen.caustic)
         weight = tiles.weight(light)
         plan = decide(use, weight, _within(light, light, weight))
-        return plan.survey({}, _counts(plan, scene, sensor, seed), None, None)
+        return plan.survey({}, pixel_counts(plan, scene, sensor, seed), None, None)
     own = seen.own
     weigh = lambda gathered: tiles.weight(own + gathered)  # noqa: E731
     if scene.use != "survey":
         found = read(maps, seen.points, weigh)
         weight = weigh(found.light)
         plan = decide(scene.use, weight, _within(own, own, weight), found)
-        return plan.survey({}, _counts(plan, scene, sensor, seed), maps[0], seen.points)
+        return plan.survey({}, pixel_counts(plan, scene, sensor, seed), maps[0], seen.points)
 
     # --- The global map ---
     first = eye.take(seen.points, dr.compress(~seen.points.caustic))
@@ -178,10 +178,10 @@ def look(
                 errors["none"] = plan.error
                 if plan.error < limit:
                     best, chosen = plan, (None, None)
-    return best.survey(errors, _counts(best, scene, sensor, seed), *chosen)
+    return best.survey(errors, pixel_counts(best, scene, sensor, seed), *chosen)
 
 
-def _counts(plan: _Plan, scene: Prepared, sensor, seed: int) -> np.ndarray | None:
+def pixel_counts(plan: _Plan, scene: Prepared, sensor, seed: int) -> np.ndarray | None:
     """Samples of each pixel: where they differ most is a matter of a few pixels, so that many eye
     paths look, and nothing is gathered."""
     if plan.each * LEAST < 1:
@@ -273,7 +273,8 @@ class _Found:
 def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points, weigh) -> _Found:
     """weigh: pairs of gathered light → weight of each pair."""
     colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
-    lanes, found, scores = tiles.lanes, [], None
+    lanes = tiles.lanes
+    found: list[Any] = []
     for width in (_NARROW, _WIDE) if not radius else (1.0, 1.0):
         size = radius
         if not radius:  # kernels as wide as they are told to be
@@ -281,16 +282,13 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
             free = footprint.of(sensor, size, width)
             free = replace(free, least=dr.opaque(mi.Float, 1e-6))
             scene = replace(scene, footprint=free)
+        scores: list[Any] = [None, None]
         if found:
             weight = weigh(0.5 * (found[0][0][0] + found[0][1][0]))
             weight = arrays.own(mi.Float, np.repeat(weight, 2 * SAMPLES).astype(np.float32))
             scores = [(dr.zeros(mi.Float, max(map_.stored, 1)), weight) for map_ in maps]
-        found.append(
-            [
-                _gathered(scene, map_, size, seed, points, colours, lanes, scores and scores[k])
-                for k, map_ in enumerate(maps)
-            ]
-        )
+        gather = partial(_gathered, scene, size, seed, points, colours, lanes)
+        found.append([gather(*each) for each in zip(maps, scores, strict=True)])
     (a, met), (b, _) = found[0]
     (wide_a, _), (wide_b, _) = found[1]
     each = dr.width(points.lane) / lanes
@@ -489,7 +487,7 @@ def _widths(tiles: Tiles, photons, change, light_paths: float) -> np.ndarray:
     return np.clip(fifth**0.2, _THINNEST, _WIDEST)
 
 
-def _gathered(scene, map_, radius, seed, points, colours, lanes, scores):
+def _gathered(scene, radius, seed, points, colours, lanes, map_, scores):
     """(light of pairs, photons an eye path meets)."""
     light, met = dr.zeros(mi.Float, lanes), 0.0
     r = dr.opaque(mi.Float, radius)

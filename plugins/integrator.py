@@ -94,7 +94,8 @@ class AnisoPhotonMapper:
        - Number of passes with fresh photons and fresh eye paths; the samples per pixel are the
          total over all passes, shared evenly. 0 is without limit: passes go on until ``time`` or
          ``target_error`` ends them, and each takes the samples per pixel that are given, but no
-         more than make 262,144 eye samples in all (and at least one a pixel).
+         more than make 524,288 eye samples in all, fewer where it has many light paths (and at
+         least one a pixel).
          (Default: 1, or 0 where ``time`` or ``target_error`` is given)
 
      * - time

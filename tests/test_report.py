@@ -298,7 +298,7 @@ def stage_of(world, photons=30_000):
 
 
 @pytest.mark.parametrize("dark", [1.0, 0.9])
-def test_a_dark_method_shows_in_energy_and_bias(monkeypatch, dark):
+def test_a_dark_method_shows_in_energy_and_bias(monkeypatch, ticking, dark):
     """Kernels normalised to 0.9 lose a tenth of the indirect light, 3 % of all light here."""
     world = mi.load_dict(room(size=24))
     ref = reference.make(world, world.sensors()[0], spp=8192)
