@@ -5,12 +5,30 @@ from pathlib import Path
 import nbformat
 import pytest
 from nbclient import NotebookClient
+from nbclient.exceptions import CellTimeoutError
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
 def read(path):
     return nbformat.read(path, as_version=4)
+
+
+def executed(path, attempts=2):
+    """The notebook with its outputs. Now and then a Jupyter kernel starts and never gets the first
+    message: then another one is started."""
+    for attempt in range(attempts):
+        notebook = read(path)
+        where = {"metadata": {"path": path.parent}}
+        client = NotebookClient(notebook, timeout=240, resources=where)
+        try:
+            client.execute()
+        except CellTimeoutError:
+            started = any(cell.get("execution_count") for cell in notebook.cells)
+            if started or attempt + 1 == attempts:
+                raise
+        else:
+            return notebook
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -23,8 +41,7 @@ def test_notebooks_are_stored_without_outputs(path):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run_and_show_pictures(path):
-    notebook = read(path)
-    NotebookClient(notebook, timeout=900, resources={"metadata": {"path": path.parent}}).execute()
+    notebook = executed(path)
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     # What widgets show, errors included, is in their own state.
     widgets = notebook.metadata.get("widgets", {})
