@@ -39,6 +39,11 @@ def variants_all(request):
 
 @pytest.fixture
 def ticking(monkeypatch):
+    """As :func:`tick`, for one test."""
+    return tick(monkeypatch)
+
+
+def tick(monkeypatch):
     """A clock by which each look at it takes a millisecond, however busy the machine is. Returns
     a function that lets more time go by."""
     now = [time.perf_counter()]

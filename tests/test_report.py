@@ -16,6 +16,7 @@ from aniso_pm.prepared import prepare
 from aniso_pm.report import cells, experiment, make, methods, metrics, reference, regions, runs
 from aniso_pm.report.plan import Plan
 from aniso_pm.settings import Settings
+from conftest import tick
 from rooms import room, room_with_ball, room_with_plate
 
 SCENE = """<scene version="3.0.0">
@@ -57,6 +58,7 @@ SCENE = """<scene version="3.0.0">
 </scene>
 """
 QUICK = ("--quick", "--time", "1", "--photons", "3000", "--spp", "1")
+BRIEF = (*QUICK, "--time", "0.4")  # by the clock that ticks
 
 
 @pytest.fixture(autouse=True)
@@ -81,7 +83,9 @@ def scene(tmp_path_factory):
 def done(scene, tmp_path_factory):
     """A quick report by the program: its directory."""
     out = tmp_path_factory.mktemp("report")
-    assert cli.main(["report", str(scene), "-o", str(out), *QUICK]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        tick(patch)
+        assert cli.main(["report", str(scene), "-o", str(out), *BRIEF]) == 0
     return out
 
 
@@ -161,7 +165,9 @@ def test_running_it_twice_gives_the_same_ratios_within_their_intervals(scene, do
 # --- Going on, failing ---
 
 
-def test_a_report_goes_on_from_the_cells_that_are_there(scene, done, tmp_path, monkeypatch):
+def test_a_report_goes_on_from_the_cells_that_are_there(
+    scene, done, tmp_path, monkeypatch, ticking
+):
     """As after kill -9: some cells are there, one was damaged, the rest was never begun."""
     (tmp_path / "cells").symlink_to(done / "cells")
     kept = {path: path.stat().st_mtime_ns for path in (done / "cells" / "tiny").iterdir()}
@@ -175,7 +181,7 @@ def test_a_report_goes_on_from_the_cells_that_are_there(scene, done, tmp_path, m
         return run(stage, method, radius, seed, budgets)
 
     monkeypatch.setattr(runs, "run", counted)
-    assert cli.main(["report", str(scene), "-o", str(tmp_path), *QUICK]) == 0
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *BRIEF]) == 0
     assert set(ran) == {("lobe/default", 2), ("path", 1)}
     again = [r for r in results(tmp_path)["rows"] if r["method"] == "isotropic/best"]
     assert again == [r for r in results(done)["rows"] if r["method"] == "isotropic/best"]
@@ -195,7 +201,7 @@ def test_a_cell_that_fails_does_not_take_the_others_with_it(
 
     monkeypatch.setattr(runs, "run", failing)
     names = ("--method", "path", "--method", "isotropic/default", "--seeds", "4", "--budgets", "2")
-    arguments = ["report", str(scene), "-o", str(tmp_path), *QUICK, *names, "--time", "0.3"]
+    arguments = ["report", str(scene), "-o", str(tmp_path), *BRIEF, *names]
     assert cli.main(arguments) == 1
     assert "path, seed 1 failed: the lamp fell over" in capfd.readouterr().out
     found = results(tmp_path)
