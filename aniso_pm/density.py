@@ -51,7 +51,7 @@ KERNEL_MASS = 1 - math.exp(-CUT2)
 # A photon on the same surface: offset along the normal in bandwidths.
 SLAB = 0.5
 # Points after which the probe gives up: 1/m is taken to be at most this.
-PROBES_MAX = 12
+PROBES_MAX = 32
 
 
 @dataclass(frozen=True)
