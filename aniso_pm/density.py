@@ -186,11 +186,10 @@ def estimate(
 def _filter(points: GatherPoints, max_depth):
     """A function of a photon's word and offset: does the photon count at these gather points, if it
     is inside the kernel and the cosine of normals is above ``least``?"""
-    n, rounding = mi.Vector3f(points.n), _rounding(points.p)
     allowed = dr.opaque(mi.UInt32, max_depth) - points.depth
 
     def counts(word, d, least=NORMAL_COS):
-        yes = faces(word, n, least) & one_sheet(word, n, d, rounding)
+        yes = same_surface(points, word, d, least)
         if max_depth:
             yes &= segments(word) <= allowed
         if points.caustic is not None:
@@ -200,10 +199,10 @@ def _filter(points: GatherPoints, max_depth):
     return counts
 
 
-def same_surface(points: GatherPoints, word, d):
+def same_surface(points: GatherPoints, word, d, least=NORMAL_COS):
     """Does the photon at the offset d lie on the surface of a point, the slab left aside?"""
     n = mi.Vector3f(points.n)
-    return faces(word, n) & one_sheet(word, n, d, _rounding(points.p))
+    return faces(word, n, least) & one_sheet(word, n, d, _rounding(points.p))
 
 
 def _rounding(p):

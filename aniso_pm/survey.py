@@ -130,7 +130,9 @@ def look(
     read = partial(_read, scene, sensor, radius, seed, tiles)
     filtered = noise_share(sensor.film())
     longest = math.inf if exactly or scene.settings.passes else _LONGEST
-    given = radius is None, light_paths, filtered, seen.work
+    # What uses are compared after: the work of path tracing, whatever the length of their passes.
+    total = _PASSES * each * tiles.pixels * float(seen.work.mean())
+    given = radius is None, light_paths, filtered, total, seen.work
     decide = partial(_Plan.of, longest, each, tiles, *given)
     if seen.points is None or not min(map_.stored for map_ in maps):
         use = scene.use
@@ -354,6 +356,7 @@ class _Plan:
         choose: bool,
         light_paths: int | None,
         filtered: float,
+        total: float,
         whole,
         use: str,
         weight,
@@ -365,6 +368,7 @@ class _Plan:
         """
         choose  widths of kernels.
         filtered  variance of eye paths that the film leaves (``film.noise_share``).
+        total   work after which ``error`` is that of the mean over all passes.
         whole   work of path tracing.
         v_own   of an eye path, without what it gathers; later: what it has more because it goes on
                 beyond the first gathered part.
@@ -374,7 +378,6 @@ class _Plan:
         work = whole if work is None else work
         v_eye = _STRATIFIED * float(v_own.mean()) + _LATER_STRATIFIED * float(np.mean(later))
         v_eye = filtered * max(v_eye, 0.0)
-        total = _PASSES * each * tiles.pixels * float(whole.mean())
         if found is None:
             pass_ = each * tiles.pixels * float(work.mean())
             error = v_eye / each * pass_ / total

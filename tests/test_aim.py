@@ -50,18 +50,14 @@ def test_the_best_aim_is_found_where_it_is_known():
     assert found.work == pytest.approx(1)
 
 
-def test_dear_paths_are_taken_less_often():
+def test_dear_paths_are_taken_less_often(monkeypatch):
     """q = 1 everywhere, c = 9 in one half: p ∝ 1/√c there, hence 0.75 and 0.25."""
     random = np.random.default_rng(5)
     numbers = random.random((2, 40_000, 5))
     work = np.where(numbers[..., 3] < 0.5, 9.0, 1.0)
     score = lambda u: np.ones(u.shape[:-1])  # noqa: E731
-    worth = aim._WORTH
-    try:
-        aim._WORTH = 2.0
-        found = learned(score, numbers, work)
-    finally:
-        aim._WORTH = worth
+    monkeypatch.setattr(aim, "_WORTH", 2.0)
+    found = learned(score, numbers, work)
     dear = found.chance[(found.low[:, 3] < 0.5) & (found.size[:, 3] <= 0.5)].sum()
     assert dear == pytest.approx(0.9 * 0.25 + 0.1 * 0.5, abs=0.02)
     even = 0.5 * (1 + 9)
