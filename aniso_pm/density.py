@@ -32,6 +32,7 @@ from . import index as spatial
 from . import summed
 from .eye import GatherPoints
 from .kernel import PlaneKernel, disc, guarded_axes
+from .lobe_path import LobeOnPath
 from .photons import (
     NORMAL_COS,
     PhotonMap,
@@ -96,14 +97,18 @@ def kernels(points: GatherPoints, radius, options: KernelOptions) -> tuple[Plane
     The disc where there is no lobe to follow, and where it cannot be followed: r is behind the
     lobe (r·z <= 0), or the ellipse is not finite.
     """
-    round_ = disc(points.n, radius)
-    path = points.path
-    if not options.anisotropic or path is None:
-        return round_, mi.Bool(False), mi.Bool(False)
+    if not options.anisotropic or points.path is None:
+        return disc(points.n, radius), mi.Bool(False), mi.Bool(False)
+    return kernels_along(points.path.lobe(), points.n, radius, options)
+
+
+def kernels_along(path: LobeOnPath, n, radius, options: KernelOptions):
+    """The same for lobes that are known; n: normals of the receivers."""
+    round_ = disc(n, radius)
     shaped = guarded_axes(
         path.lobe,
         path.r,
-        points.n,
+        n,
         path.distance,
         radius,
         options.epsilon,

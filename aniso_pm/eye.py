@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .index import curve_order
-from .lobe_path import LobeOnPath, follow, no_lobe
+from .lobe_path import GlossyVertex, follow, no_lobe
 from .rays import largest_coordinate, spawn_ray
 from .receivers import gathered_part, read_receiver
 from .spectra import channel_mean
@@ -120,7 +120,7 @@ class GatherPoints:
     p, n       position; geometric normal of the side that is seen.
     weight     path throughput; times the BRDF value (1/sr) where the receiver is Lambertian.
     depth      path segments from the camera.
-    path       LobeOnPath, or None where the scene has no anisotropic lobes.
+    path       GlossyVertex, or None where the scene has no anisotropic lobes.
     origin, d  ray that found p, or None where all receivers are Lambertian.
     lambertian is the receiver Lambertian? None where all are.
     caustic    only caustic photons are to be read; None where all points agree. (survey: they are
@@ -133,7 +133,7 @@ class GatherPoints:
     n: Any
     weight: Any
     depth: Any
-    path: LobeOnPath | None
+    path: GlossyVertex | None
     origin: Any
     d: Any
     lambertian: Any
@@ -217,7 +217,7 @@ def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room, see
     return L, valid, rows, points
 
 
-def _first_lobe(o: WalkOptions) -> LobeOnPath | None:
+def _first_lobe(o: WalkOptions) -> GlossyVertex | None:
     return no_lobe() if o.follow_lobes else None
 
 

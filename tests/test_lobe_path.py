@@ -30,7 +30,8 @@ def earlier_blur(path):
     1/λ' = 1/λ + p, 1/μ' = 1/μ + p and blur = p + 1/√(λμ) give (1/λ' − p)(1/μ' − p) = (blur − p)².
     """
     a, b, blur = (
-        np.array(v, dtype=np.float64) for v in (1 / path.lobe.lam, 1 / path.lobe.mu, path.blur)
+        np.array(v, dtype=np.float64)
+        for v in (1 / path.lobe().lobe.lam, 1 / path.lobe().lobe.mu, path.blur)
     )
     return (a * b - blur**2) / (a + b - 2 * blur)
 
@@ -54,7 +55,8 @@ def test_no_lobe_is_carried_where_nothing_is_anisotropic():
 def test_lobes_stay_frames_that_face_the_path():
     points = gather_points("brushed conductor")
     valid = points.path.valid.numpy()
-    for axis in (points.path.lobe.x, points.path.lobe.y, points.path.lobe.z):
+    path = points.path.lobe()
+    for axis in (path.lobe.x, path.lobe.y, path.lobe.z):
         norm = dr.norm(axis).numpy()[valid]
         np.testing.assert_allclose(norm, 1, atol=1e-5)
-    assert (dr.dot(points.path.r, points.path.lobe.z).numpy()[valid] > 0).mean() > 0.99
+    assert (dr.dot(path.r, path.lobe.z).numpy()[valid] > 0).mean() > 0.99

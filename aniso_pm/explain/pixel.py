@@ -269,7 +269,7 @@ def _kernel(prepared: Prepared, point, radius: float, lost: bool):
     options = prepared.kernel_options
     plane, follows, degenerate = density.kernels(point, mi.Float(radius), options)
     follows, degenerate = bool(follows[0]), bool(degenerate[0])
-    path = point.path
+    path = None if point.path is None else point.path.lobe()
     lobe = None
     if path is not None and bool(path.valid[0]):
         lobe = _lobe(path)

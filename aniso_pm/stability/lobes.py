@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import drjit as dr
@@ -30,7 +29,6 @@ from .lanes import (
     vec,
     words,
 )
-from .sums import gather_points
 
 # Asked for: kernel axes within 1e-3 of the definition. Squared lengths: twice that.
 AXES = 1e-3
@@ -100,10 +98,10 @@ def _axes_behind(rule) -> Measured:
 def _kernel_behind(rule) -> Measured:
     """Behind the lobe the integrator takes the disc, and says so."""
     lobe, r = _behind()
-    path = LobeOnPath(asg(lobe), vec(r), mi.Float(2), mi.Float(0), dr.full(mi.Bool, True, len(r)))
-    points = replace(gather_points(np.zeros_like(r)), n=mi.Normal3f(vec(-r)), path=path)
+    path = LobeOnPath(asg(lobe), vec(r), mi.Float(2), dr.full(mi.Bool, True, len(r)))
     options = density.KernelOptions(True, rule, "bandwidth", EPSILON, True, 32.0)
-    kernel, _, degenerate = density.kernels(points, mi.Float(0.1), options)
+    n = mi.Normal3f(vec(-r))
+    kernel, _, degenerate = density.kernels_along(path, n, mi.Float(0.1), options)
     lengths = [np.linalg.norm(arr(w), axis=1) for w in (kernel.s, kernel.t)]
     errors = np.max(np.abs(np.array(lengths) / 0.1 - 1), 0)
     return Measured(*worst_of(errors, words(lobe)), float(np.mean(np.array(degenerate))))
