@@ -161,7 +161,7 @@ def disc(n, radius) -> PlaneKernel:
 
 
 def guarded_axes(
-    lobe: ASG, r, n, distance, radius, epsilon, rule, guard=True, max_aspect=32.0, size="bandwidth"
+    lobe: ASG, r, n, distance, radius, epsilon, rule, guard=True, max_aspect=24.0, size="bandwidth"
 ) -> PlaneKernel:
     """The integrator's kernel: rule, guard, projection, aspect cap and size in one.
 

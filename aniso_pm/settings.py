@@ -21,7 +21,7 @@ class Settings:
     size: str = "bandwidth"
     epsilon: float = 0.02
     guard: bool = True
-    max_aspect: float = 32.0
+    max_aspect: float = 24.0
     map: str = "auto"
     final_gather: bool = False
     gather_roughness: float = 0.2

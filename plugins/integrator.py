@@ -56,7 +56,7 @@ class AnisoPhotonMapper:
 
      * - max_aspect
        - |float|
-       - Largest ratio of a kernel's axes, between 1 and 10,000. (Default: 32)
+       - Largest ratio of a kernel's axes, between 1 and 10,000. (Default: 24)
 
      * - map
        - |string|
