@@ -118,7 +118,7 @@ def merge(states: dict[str, State]) -> State:
         arrays = {k: v + state.arrays[k] for k, v in arrays.items()}
         statistics = add_counts(statistics, state.statistics)
         seconds += state.seconds
-    return State(first.identity, first.film, _joined(passes), seconds, statistics, arrays)
+    return State(first.identity, first.film, joined(passes), seconds, statistics, arrays)
 
 
 def numbers(passes):
@@ -128,7 +128,7 @@ def numbers(passes):
 
 def extended(passes: list[list[int]], number: int) -> list[list[int]]:
     """The ranges with one more pass."""
-    return _joined([*passes, [number, number + 1]])
+    return joined([*passes, [number, number + 1]])
 
 
 def describe(passes) -> str:
@@ -154,14 +154,15 @@ def _holds(passes, number: int) -> bool:
     return any(start <= number < end for start, end in passes)
 
 
-def _joined(passes) -> list[list[int]]:
-    joined: list[list[int]] = []
+def joined(passes) -> list[list[int]]:
+    """Disjoint ranges in order, those that touch as one."""
+    result: list[list[int]] = []
     for start, end in sorted(map(list, passes)):
-        if joined and joined[-1][1] == start:
-            joined[-1][1] = end
+        if result and result[-1][1] == start:
+            result[-1][1] = end
         else:
-            joined.append([start, end])
-    return joined
+            result.append([start, end])
+    return result
 
 
 def _checksum(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:

@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 from aniso_pm import output
 from aniso_pm._version import __version__
-from aniso_pm.errors import InputError, is_interrupt, one_line
+from aniso_pm.errors import Failed, InputError, is_interrupt, one_line
 
 from . import bench, examine, explain, reference, render, report, scenes
 from .common import INTERRUPTED, InterruptError
@@ -33,6 +33,8 @@ def main(arguments: list[str] | None = None) -> int:
         return app(args=arguments, prog_name="aniso-pm", standalone_mode=False) or 0
     except (InputError, output.OutputError) as error:
         return _fail(2, str(error), error)
+    except Failed as error:
+        return _fail(1, str(error), error)
     except BrokenPipeError:
         # The reader of our output has left ("| head"): nobody to tell.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

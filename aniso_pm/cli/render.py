@@ -25,6 +25,17 @@ from .common import (
     parse_defines,
     set_variant,
 )
+from .workers import (
+    Mixed,
+    Scheduler,
+    SchedulerFile,
+    TaskLimit,
+    TlsCa,
+    TlsCert,
+    TlsKey,
+    Workers,
+    rendering_elsewhere,
+)
 
 
 def render(
@@ -59,6 +70,14 @@ def render(
         float, typer.Option(min=0, help="Seconds between savings of picture and state.")
     ] = 30.0,
     sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    scheduler_file: SchedulerFile = None,
+    mixed: Mixed = False,
+    task_limit: TaskLimit = None,
+    tls_ca_file: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no warnings.")] = False,
     as_json: Annotated[
@@ -75,6 +94,10 @@ def render(
     saved again and again; --resume goes on from there. Finished pictures lose their state unless
     --resume or --keep-state was given. Passes 8 to 15 of a picture, to be merged with passes 0 to
     7, are --first-pass 8 --passes 8 with the same samples per pass.
+
+    --workers 4 renders the passes in four processes of this machine, --scheduler or
+    --scheduler-file on the workers of a Dask cluster, with the same picture. Whoever can reach a
+    Dask scheduler can run code on its workers: use TLS, or a network of your own.
     """
     # --- Find out what would fail, before anything slow ---
     defines = parse_defines(define or [])
@@ -118,7 +141,21 @@ def render(
             integrator.checkpoint = Checkpoint(state_file, save_every, resume, write)
             if resume and not state_file.exists() and not quiet:
                 print(f"aniso-pm: no state '{state_file}' yet, starting afresh", file=sys.stderr)
-        _render(world, camera, integrator, seed, spp, quiet)
+        with rendering_elsewhere(
+            integrator,
+            scene,
+            defines,
+            sensor,
+            workers,
+            scheduler,
+            scheduler_file,
+            {"ca_file": tls_ca_file, "client_cert": tls_cert, "client_key": tls_key},
+            mixed=mixed,
+            task_limit=task_limit,
+            # As often as the picture is saved.
+            home_every=max(save_every, 1.0),
+        ):
+            _render(world, camera, integrator, seed, spp, quiet)
         record = write()
         statistics = record["statistics"]
         if kept is False and not statistics["interrupted"]:
@@ -129,6 +166,13 @@ def render(
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
     elif not quiet:
         print(_done(record, out, picture))
+    if statistics.get("failure"):
+        done = f"{statistics['passes']} passes" if statistics["passes"] else "part of a pass"
+        print(
+            f"aniso-pm: error: {statistics['failure']}; the picture so far ({done}) is written",
+            file=sys.stderr,
+        )
+        return 1
     if statistics.get("interrupted"):
         print("aniso-pm: interrupted, the picture so far is written", file=sys.stderr)
         return INTERRUPTED
