@@ -131,6 +131,16 @@ def extended(passes: list[list[int]], number: int) -> list[list[int]]:
     return joined([*passes, [number, number + 1]])
 
 
+def missing(passes, first: int, count: int) -> list[list[int]]:
+    """Ranges of those passes from ``first`` to ``first + count - 1`` that are not in ``passes``."""
+    found, at = [], first
+    for start, end in [*joined(passes), [first + count, first + count]]:
+        if start > at:
+            found.append([at, min(start, first + count)])
+        at = max(at, end)
+    return [[a, b] for a, b in found if a < b]
+
+
 def describe(passes) -> str:
     """ "0-7, 16-23": ranges of pass numbers for people."""
     return ", ".join(f"{a}-{b - 1}" if b - a > 1 else f"{a}" for a, b in passes) or "none"

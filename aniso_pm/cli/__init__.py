@@ -16,7 +16,7 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import Failed, InputError, is_interrupt, one_line
 
-from . import bench, examine, explain, reference, render, report, scenes
+from . import bench, cluster, examine, explain, reference, render, report, scenes
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -87,5 +87,6 @@ for command in (
     examine.stability,
     examine.doctor,
     bench.bench,
+    cluster.cluster,
 ):
     app.command()(command)

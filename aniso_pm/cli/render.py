@@ -30,6 +30,7 @@ from .workers import (
     Scheduler,
     SchedulerFile,
     TaskLimit,
+    TaskSeconds,
     TlsCa,
     TlsCert,
     TlsKey,
@@ -74,6 +75,7 @@ def render(
     scheduler: Scheduler = None,
     scheduler_file: SchedulerFile = None,
     mixed: Mixed = False,
+    task_seconds: TaskSeconds = 5.0,
     task_limit: TaskLimit = None,
     tls_ca_file: TlsCa = None,
     tls_cert: TlsCert = None,
@@ -151,6 +153,7 @@ def render(
             scheduler_file,
             {"ca_file": tls_ca_file, "client_cert": tls_cert, "client_key": tls_key},
             mixed=mixed,
+            task_seconds=task_seconds,
             task_limit=task_limit,
             # As often as the picture is saved.
             home_every=max(save_every, 1.0),
@@ -182,6 +185,12 @@ def render(
 def merge(
     states: Annotated[list[Path], typer.Argument(help="States (.state), or their pictures.")],
     out: Annotated[Path, typer.Option("--output", "-o", help="Picture to write (.exr).")],
+    passes: Annotated[
+        int | None, typer.Option(min=1, max=10**7, help="Say which of so many passes are missing.")
+    ] = None,
+    first_pass: Annotated[
+        int, typer.Option(min=0, max=10**7, help="Number of the first of those.")
+    ] = 0,
     png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
@@ -191,10 +200,11 @@ def merge(
 
     Writes the picture and, beside it, the state of all passes, from which it can be merged again
     or resumed. All must have the same scene, parameters, seed and samples per pass, and no pass
-    may occur twice.
+    may occur twice. Jobs that still render may be merged, too: with what they have so far. --passes
+    tells on standard error which passes are missing from the picture.
     """
     from aniso_pm import film as films
-    from aniso_pm.state import State, StateError
+    from aniso_pm.state import State, StateError, describe, missing
     from aniso_pm.state import merge as merged
 
     if out.suffix.lower() != ".exr":
@@ -203,13 +213,14 @@ def merge(
     for path in filter(None, [out, picture]):
         output.check_writable(path)
     try:
-        loaded = {}
-        for name in states:
+        total, loaded = None, []
+        for name in states:  # one after the other: there may be thousands of large ones
             path = name.with_suffix(".state") if name.suffix.lower() == ".exr" else name
             if str(path) in loaded:
                 raise InputError(f"{path}: named twice")
-            loaded[str(path)] = State.load(path)
-        total = merged(loaded)
+            state = State.load(path)
+            total = merged({loaded[0]: total, str(path): state}) if total else state
+            loaded.append(str(path))
     except StateError as error:
         raise InputError(str(error)) from error
     except OSError as error:
@@ -222,8 +233,9 @@ def merge(
         raise InputError(str(error)) from error
     films.show_array(film, total.arrays["first"])
     record = {
-        "merged": list(loaded),
+        "merged": loaded,
         "passes": total.passes,
+        "missing": missing(total.passes, first_pass, passes) if passes else None,
         "seed": total.identity["seed"],
         "variant": total.identity["variant"],
         "statistics": total.statistics,
@@ -233,6 +245,12 @@ def merge(
     if picture:
         output.write_png(film, picture)
     total.save(out.with_suffix(".state"))
+    if record["missing"]:
+        count = sum(end - start for start, end in record["missing"])
+        print(
+            f"aniso-pm: {count} of {passes} passes are missing: {describe(record['missing'])}",
+            file=sys.stderr,
+        )
     if as_json:
         record |= {"output": str(out), "png": str(picture) if picture else None}
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))

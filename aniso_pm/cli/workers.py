@@ -25,6 +25,9 @@ SchedulerFile = Annotated[
 Mixed = Annotated[
     bool, typer.Option("--mixed", help="Let LLVM and CUDA workers render one picture.")
 ]
+TaskSeconds = Annotated[
+    float, typer.Option("--task-seconds", min=0.01, help="Seconds that a worker's task takes.")
+]
 TaskLimit = Annotated[
     float | None,
     typer.Option("--task-limit", min=0.1, help="Seconds after which a worker's task has hung."),

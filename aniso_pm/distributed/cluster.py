@@ -14,6 +14,8 @@ from aniso_pm.errors import InputError, one_line
 
 # Seconds to connect to a scheduler.
 _CONNECT = 10
+# Ctrl-C is for the client to take, which asks the workers for what they have.
+_PRELOAD = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 # Only this machine reaches local clusters.
 _LOOPBACK = "127.0.0.1"
 
@@ -54,6 +56,7 @@ def local(workers: int) -> Iterator[Any]:
                 dashboard_address=f"{_LOOPBACK}:0",
                 local_directory=folder,
                 memory_limit=0,  # renderings keep within max_memory
+                preload=_PRELOAD,
                 silence_logs=logging.CRITICAL,
             )
         )
@@ -74,21 +77,23 @@ def connected(
     require()
     from distributed import Client
     from distributed.security import Security
+    from distributed.utils import silence_logging_cmgr
 
     place = scheduler or str(scheduler_file)
     if scheduler_file is not None and not Path(scheduler_file).is_file():
         raise InputError(f"{scheduler_file}: there is no such file; does the scheduler run?")
     given: dict[str, Any] = {"security": Security(require_encryption=True, **tls)} if tls else {}
     given["scheduler_file" if scheduler_file else "address"] = place
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    try:
-        client = Client(timeout=_CONNECT, set_as_default=False, **given)
-    except (OSError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError(
-            f"no Dask scheduler answers at {place} ({one_line(error)}); start one with `dask "
-            "scheduler`, or render on this machine with --workers"
-        ) from error
-    try:
-        yield client
-    finally:
-        client.close()
+    # What goes wrong is said by us, in one line.
+    with silence_logging_cmgr(logging.CRITICAL):
+        try:
+            client = Client(timeout=_CONNECT, set_as_default=False, **given)
+        except (OSError, ValueError, TypeError, RuntimeError) as error:
+            raise InputError(
+                f"no Dask scheduler answers at {place} ({one_line(error)}); start one with `dask "
+                "scheduler`, or render on this machine with --workers"
+            ) from error
+        try:
+            yield client
+        finally:
+            client.close()

@@ -88,12 +88,15 @@ def unpacked(plain: Any, folder: Path) -> Any:
     if plain.kind == "ndarray":
         return plain.values
     if plain.kind == _BITMAP:
-        names = plain.more["channels"]
-        bitmap = mi.Bitmap(plain.values, mi.Bitmap.PixelFormat(plain.more["pixel_format"]), names)
+        names, formats = plain.more["channels"], mi.Bitmap.PixelFormat
+        bitmap = mi.Bitmap(plain.values, getattr(formats, plain.more["pixel_format"]), names)
         bitmap.set_srgb_gamma(plain.more["srgb_gamma"])
         bitmap.set_premultiplied_alpha(plain.more["premultiplied"])
         return bitmap
-    return getattr(mi, plain.kind)(plain.values)
+    made = getattr(mi, plain.kind)(plain.values)
+    if "inverse_transpose" in plain.more:
+        made.inverse_transpose = type(made.inverse_transpose)(plain.more["inverse_transpose"])
+    return made
 
 
 def _found(path: Path, place: str) -> Path:
@@ -109,7 +112,7 @@ def _marked(value, place: str) -> Marked:
         return Marked("ndarray", np.asarray(value), {})
     if isinstance(value, mi.Bitmap):
         more = {
-            "pixel_format": int(value.pixel_format()),
+            "pixel_format": value.pixel_format().name,
             "channels": [field.name for field in value.struct_()],
             "srgb_gamma": value.srgb_gamma(),
             "premultiplied": value.premultiplied_alpha(),
@@ -117,9 +120,11 @@ def _marked(value, place: str) -> Marked:
         return Marked(_BITMAP, np.array(value), more)
     for name in _TRANSFORMS:
         if kind is getattr(mi, name, None):
-            matrix = np.array(value.matrix)
+            # The inverse, too: computed anew it would differ in the last digits.
+            both = np.array(value.matrix), np.array(value.inverse_transpose)
             # Transforms of one lane each, where they are those of a variant.
-            return Marked(name, matrix[..., 0] if matrix.ndim == 3 else matrix, {})
+            one = [m[..., 0] if m.ndim == 3 else m for m in both]
+            return Marked(name, one[0], {"inverse_transpose": one[1]})
     for name in (*_SMALL, "TensorXf", "TensorXd"):
         if kind is getattr(mi, name, None):
             return Marked(name, np.array(value), {})

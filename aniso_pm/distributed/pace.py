@@ -51,7 +51,9 @@ class Pace:
         count = max(1, round(self.task_seconds / self.each))
         if left < math.inf:  # towards the end smaller ones, so that all workers end together
             count = min(count, math.ceil(left / (2 * workers)))
-        return int(min(count, left, round(seconds / self.each) if seconds < math.inf else count))
+        if seconds < math.inf:
+            count = min(count, max(0, round(seconds / self.each)))
+        return int(min(count, left))
 
     def limit(self, passes: int, idle: bool = False) -> float:
         """Seconds that a task may take. idle: is there a worker with nothing to do?"""

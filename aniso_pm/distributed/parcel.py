@@ -54,15 +54,16 @@ class Parcel:
         """Of a scene file or dictionary. Raises InputError for a file that is not there."""
         if isinstance(scene, Mapping):
             plain, files, sources = dictionaries.packed(scene)
+            values: dict[str, str] = {}
         else:
             found = Closure(Path(scene), defines or {})
-            plain, files, sources = None, found.files, found.sources
+            plain, files, sources, values = None, found.files, found.sources, found.defines
         data = _archive(files)
         return Parcel(
             np.frombuffer(data, np.uint8),
             hashlib.sha256(data).hexdigest(),
             plain,
-            dict(defines or {}),
+            values,
             {name: str(path) for name, path in sources.items()},
         )
 

@@ -4,8 +4,8 @@ The closure of a scene is found in its text: included files, and whatever an att
 or a parameter ``filename`` names, with the parameters of the scene (``$key``) put in. Each file
 gets a folder of its own, with a number for a name, in which it keeps its own name (objects are
 called after their files); the text says that instead, so that it depends on no other folder any
-more. The rest of the text, numbers above all, stays as it is. Names are looked up as Mitsuba does: beside the
-scene, in the folders that ``<path>`` adds, in the working directory.
+more. The rest of the text, numbers above all, stays as it is. Names are looked up as Mitsuba does:
+beside the scene, in the folders that ``<path>`` adds, in the working directory.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ MAIN = "scene.xml"
 
 
 class Closure:
-    """Files of a scene: ``files`` is packed name → content, ``sources`` packed name → where from.
+    """Files of a scene: ``files`` is packed name → content, ``sources`` packed name → where from;
+    ``defines`` are the parameters that its text still has.
 
     scene    the XML file.
     defines  values of its parameters.
@@ -34,13 +35,17 @@ class Closure:
         self._names: dict[Path, str] = {}
         self._folders = [Path(scene).resolve().parent, Path.cwd()]
         self._values = dict(defines)
-        self._texts: set[Path] = set()
-        self._scene = Path(scene).resolve()
-        self._text(self._scene, MAIN)
+        self._texts: list[str] = []
+        self._text(Path(scene).resolve(), MAIN)
+        # Mitsuba refuses parameters that nothing uses, any more.
+        texts = [self.files[name].decode() for name in self._texts]
+        used = {name for text in texts for name in re.findall(self._pattern(), text)}
+        self.defines = {name: value for name, value in defines.items() if name in used}
 
     def _text(self, path: Path, name: str) -> None:
         """Take in an XML file, and what it names."""
         self._names[path], self.sources[name] = name, path
+        self._texts.append(name)
         root = ElementTree.fromstring(path.read_bytes())
         for parent in root.iter():
             for element in list(parent):
@@ -86,11 +91,11 @@ class Closure:
 
     def _filled(self, text: str) -> str:
         """With the values of parameters. The longest name that fits counts, as in Mitsuba."""
+        return re.sub(self._pattern(), lambda match: self._values[match[1]], text)
+
+    def _pattern(self) -> str:
         names = sorted(filter(None, self._values), key=len, reverse=True)
-        if not names or "$" not in text:
-            return text
-        pattern = r"\$(" + "|".join(map(re.escape, names)) + ")"
-        return re.sub(pattern, lambda match: self._values[match[1]], text)
+        return r"\$(" + "|".join(map(re.escape, names)) + ")" if names else r"(?!)()"
 
 
 def packed_name(number: int, path: Path) -> str:
