@@ -3,9 +3,6 @@
 import asyncio
 import os
 import signal
-import subprocess
-import sys
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -37,9 +34,7 @@ def client():
 
 
 def scene(**parameters):
-    """A room whose map, radius and light paths a pilot chooses."""
-    own = {"type": "aniso_pm", "photon_count": 3000}
-    return room_with_ball(SIZE) | {"integrator": own | parameters}
+    return room_with_ball(SIZE) | {"integrator": SMALL | parameters}
 
 
 def alone(definition, spp, seed=0, **rules):
@@ -76,14 +71,12 @@ def fails_on(client, addresses, function, *arguments):
 
 
 def _pretend_version(name, version):
-    from aniso_pm.distributed import worker
 
     worker._mended = worker.versions
     worker.versions = lambda: worker._mended() | {name: version}
 
 
 def _mend():
-    from aniso_pm.distributed import worker
 
     worker.versions = worker._mended
 
@@ -93,10 +86,12 @@ def _mend():
 
 def test_workers_render_the_same_picture_as_one_process(client):
     seen = []
+    # A pilot chooses everything, pixel by pixel.
+    chosen = scene(map="auto", photon_count=0, initial_radius=0.0)
     done = render(
-        scene(), client, spp=36, seed=3, passes=12, progress=lambda *what: seen.append(what)
+        chosen, client, spp=36, seed=3, passes=12, progress=lambda *what: seen.append(what)
     )
-    image, variance, statistics = alone(scene(), 36, 3, passes=12)
+    image, variance, statistics = alone(chosen, 36, 3, passes=12)
     assert_same_picture(done.image, image)
     np.testing.assert_allclose(done.variance, variance, rtol=0.02, atol=1e-7)
     for name in ("passes", "spp", "photons_emitted", "eye_samples", "map"):
@@ -105,6 +100,14 @@ def test_workers_render_the_same_picture_as_one_process(client):
     assert not done.statistics["interrupted"]
     assert [what[1] for what in seen] == [12] * len(seen) and seen[-1][0] == 12
     assert [what[0] for what in seen] == sorted(what[0] for what in seen)
+
+
+@pytest.mark.parametrize("passes, spp", [(1, 3), (4, 10)])
+def test_passes_that_share_samples_unevenly_and_a_single_one(client, passes, spp):
+    done = render(scene(passes=passes), client, spp=spp)
+    image, variance, statistics = alone(scene(), spp, passes=passes)
+    assert_same_picture(done.image, image)
+    assert done.statistics["spp"] == spp and (done.variance is None) == (passes == 1)
 
 
 def test_files_travel_to_workers_whose_directory_has_none(client, spread):  # noqa: F811
@@ -139,6 +142,10 @@ def test_an_error_that_is_aimed_at_ends_rendering(client):
     done = render(scene(), client, spp=4, target_error=0.2)
     assert done.statistics["relative_error"] <= 0.2
     assert 4 <= done.statistics["passes"] < 2000
+
+
+def test_time_ends_rendering_but_not_before_the_first_pass(client):
+    assert 1 <= render(scene(), client, spp=2, time=1e-3).statistics["passes"] <= 8
 
 
 def test_asynchronous_clients_are_awaited(client):

@@ -1,4 +1,4 @@
-"""A scene travels with all its files, unpacks below one folder only, and loads as the same scene."""
+"""A scene travels with all its files, unpacks below one folder only, and loads as the same."""
 
 import io
 import tarfile

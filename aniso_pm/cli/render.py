@@ -213,14 +213,16 @@ def merge(
     for path in filter(None, [out, picture]):
         output.check_writable(path)
     try:
-        total, loaded = None, []
-        for name in states:  # one after the other: there may be thousands of large ones
-            path = name.with_suffix(".state") if name.suffix.lower() == ".exr" else name
-            if str(path) in loaded:
+        loaded = [
+            str(name.with_suffix(".state") if name.suffix.lower() == ".exr" else name)
+            for name in states
+        ]
+        for path in loaded:
+            if loaded.count(path) > 1:
                 raise InputError(f"{path}: named twice")
-            state = State.load(path)
-            total = merged({loaded[0]: total, str(path): state}) if total else state
-            loaded.append(str(path))
+        total = State.load(Path(loaded[0]))
+        for path in loaded[1:]:  # one after the other: there may be thousands of large ones
+            total = merged({loaded[0]: total, path: State.load(Path(path))})
     except StateError as error:
         raise InputError(str(error)) from error
     except OSError as error:

@@ -40,7 +40,8 @@ _AHEAD = 2
 _SALVAGE = 10.0
 # Groups of deaths (Dask counts each task's) without one finished task, after which it is given up.
 _DEATHS = 3
-# Bringing home may take this share of the time where an error is aimed at, at least so often.
+# Where an error is aimed at, or a state is due to be saved, sums come home so often at most: share
+# of the time, and seconds.
 _HOME_SHARE, _HOME_LEAST = 0.05, 1.0
 
 
@@ -232,6 +233,8 @@ class _Dispatch:
         limit = self.run.scene.settings.time
         if not limit:
             return math.inf
+        if self.began:
+            return limit
         ahead = sum(c.passes for c in self.rendering) * (self.pace.each or 0) / workers
         return limit - self.run.stopping.spent() - ahead
 
@@ -374,8 +377,8 @@ class _Dispatch:
             return False
         if (self.enough or self.ledger.left == 0) and all(c.done for c in self.carriers.values()):
             return True
-        every = self.options.home_every
-        if self.run.scene.settings.target_error:
+        every, checkpoint = self.options.home_every, self.run.controls.checkpoint
+        if self.run.scene.settings.target_error or (checkpoint and checkpoint.due()):
             every = min(every, max(_HOME_LEAST, self.home_cost / _HOME_SHARE))
         return time.monotonic() - self.home > every
 
