@@ -217,12 +217,12 @@ def merge(
             str(name.with_suffix(".state") if name.suffix.lower() == ".exr" else name)
             for name in states
         ]
-        for path in loaded:
-            if loaded.count(path) > 1:
-                raise InputError(f"{path}: named twice")
+        for file in loaded:
+            if loaded.count(file) > 1:
+                raise InputError(f"{file}: named twice")
         total = State.load(Path(loaded[0]))
-        for path in loaded[1:]:  # one after the other: there may be thousands of large ones
-            total = merged({loaded[0]: total, path: State.load(Path(path))})
+        for file in loaded[1:]:  # one after the other: there may be thousands of large ones
+            total = merged({loaded[0]: total, file: State.load(Path(file))})
     except StateError as error:
         raise InputError(str(error)) from error
     except OSError as error:
