@@ -105,7 +105,7 @@ def test_kills_of_workers_and_of_the_client_leave_the_same_picture(scene, tmp_pa
         while passes_in(tmp_path / "a.state") <= begun and program.poll() is None:
             time.sleep(0.2)
         time.sleep(chance.uniform(0, 1.5))
-        assert program.poll() is None, "it was faster than its murderers"
+        assert program.poll() is None, program.communicate()
         whom = chance.choice([name for name, left in kills.items() if left])
         kills[whom] -= 1
         log.append((whom, passes_in(tmp_path / "a.state")))
@@ -139,7 +139,7 @@ def test_a_worker_that_hangs_is_replaced_and_its_passes_are_rendered(capfd):
 
         from aniso_pm import distributed
 
-        options = Options(task_seconds=0.3, task_limit=4.0, home_every=0.5, restart=True)
+        options = Options(task_seconds=0.3, task_limit=4.0, home_every=0.5, keep=2)
         made = distributed.Elsewhere
         distributed.Elsewhere = lambda *arguments: made(*arguments, warn=told.append)
         try:

@@ -37,6 +37,10 @@ TlsCert = Annotated[Path | None, typer.Option("--tls-cert", help="Certificate, l
 TlsKey = Annotated[Path | None, typer.Option("--tls-key", help="Key, likewise.")]
 
 
+# Seconds for processes of this machine to start, or to be started again, however busy it is.
+_LOCAL_PATIENCE = 180.0
+
+
 @contextmanager
 def rendering_elsewhere(
     integrator,
@@ -84,7 +88,8 @@ def rendering_elsewhere(
     else:
         place = connected(scheduler, scheduler_file, tls_given)
     with place as client:
-        chosen = Options(restart=bool(workers), **options)
+        patience = _LOCAL_PATIENCE if workers else Options.patience
+        chosen = Options(keep=workers or 0, patience=patience, **options)
         integrator.elsewhere = Elsewhere(client, parcel, sensor, chosen, warn)
         try:
             yield

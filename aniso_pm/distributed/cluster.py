@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from aniso_pm.errors import InputError, one_line
+from aniso_pm.errors import Failed, InputError, one_line
 
 # Seconds to connect to a scheduler.
 _CONNECT = 10
@@ -44,11 +44,13 @@ def local(workers: int) -> Iterator[Any]:
         # Statements about single tasks are ours.
         "distributed.admin.large-graph-warning-threshold": "1GB",
         "distributed.scheduler.allowed-failures": 10,
+        # A worker that its nanny starts again may take long where the machine is busy.
+        "distributed.deploy.lost-worker-timeout": "60s",
     }
     with dask.config.set(settings), ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="aniso_pm-workers-"))
-        cluster = stack.enter_context(
-            LocalCluster(
+        try:
+            cluster = LocalCluster(
                 n_workers=workers,
                 threads_per_worker=max(1, (cores or 1) // workers),
                 processes=True,
@@ -59,7 +61,9 @@ def local(workers: int) -> Iterator[Any]:
                 preload=_PRELOAD,
                 silence_logs=logging.CRITICAL,
             )
-        )
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise Failed(f"worker processes could not be started: {one_line(error)}") from error
+        stack.enter_context(cluster)
         yield stack.enter_context(Client(cluster))
 
 

@@ -18,6 +18,8 @@ from . import worker
 
 # Seconds between two looks at who is there.
 _LOOK = 0.5
+# Seconds for a nanny to bring back a worker of ours.
+_MISSED = 30.0
 # Seconds for a worker to come while the others are refused.
 _GRACE = 3.0
 # Seconds in which a worker has to load the scene.
@@ -35,17 +37,26 @@ class Crew:
 
     client    a blocking ``distributed.Client``.
     patience  seconds to wait for a first worker, or another one when all are gone.
+    keep      workers that the client's own cluster is to have; 0: it has none of its own.
     warn      called with a sentence for each worker that is not used.
     """
 
-    def __init__(self, client, job: worker.Job, patience: float, warn: Callable[[str], None]):
-        self.client, self._job, self._patience, self._warn = client, job, patience, warn
+    def __init__(
+        self,
+        client,
+        job: worker.Job,
+        patience: float,
+        keep: int,
+        warn: Callable[[str], None],
+    ):
+        self.client, self._job, self._warn = client, job, warn
+        self._patience, self._keep = patience, keep
         self.good: dict[str, dict[str, Any]] = {}
         self.refused: dict[str, str] = {}
         self._joining: dict[str, _Candidate] = {}
         self._known: set[str] = set()
         self._looked = 0.0
-        self._some = time.monotonic()  # when there was last anybody
+        self._some = self._complete = time.monotonic()  # when there was last anybody, everybody
         self.job = None  # the job where workers can get it, sent once
 
     def update(self) -> None:
@@ -55,6 +66,11 @@ class Crew:
             return
         self._looked = now
         self._look()
+        if len(self._known) >= self._keep:
+            self._complete = now
+        elif now - self._complete > _MISSED:  # its nanny has not brought it back
+            self._complete = now
+            self.client.cluster.scale(self._keep)
         for address in self._known - {*self.good, *self.refused, *self._joining}:
             self._ask(address)
         self._hear()

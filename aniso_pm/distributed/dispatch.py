@@ -55,7 +55,8 @@ class Options:
     patience      seconds to wait for a first worker, or for another when all are gone.
     home_every    seconds after which sums come home, at the latest.
     mixed         may LLVM and CUDA workers render the same picture?
-    restart       restart workers that hang (those of a cluster of one's own).
+    keep          workers that a cluster of one's own has: those that hang, or are lost, are started
+                  again. 0: the cluster is that of somebody else.
     """
 
     task_seconds: float = 5.0
@@ -63,7 +64,7 @@ class Options:
     patience: float = 30.0
     home_every: float = 30.0
     mixed: bool = False
-    restart: bool = False
+    keep: int = 0
 
     def __post_init__(self):
         for name in ("task_seconds", "task_limit", "patience", "home_every"):
@@ -139,7 +140,8 @@ class _Dispatch:
     def __init__(self, elsewhere: Elsewhere, run: Run):
         self.run, self.client, self.options = run, elsewhere.client, elsewhere.options
         self.job = elsewhere.job(run)
-        self.crew = Crew(self.client, self.job, self.options.patience, elsewhere.warn)
+        patience, keep = self.options.patience, self.options.keep
+        self.crew = Crew(self.client, self.job, patience, keep, elsewhere.warn)
         self.pace = Pace(self.options.task_seconds, self.options.task_limit)
         first, count = run.controls.first_pass, run.scene.settings.passes
         self.ledger = Ledger(first, count, run.done.passes)
@@ -317,7 +319,7 @@ class _Dispatch:
         self.crew.refuse(address, f"a task has not ended in {seconds:.0f} seconds")
         for carrier in [c for c in self.carriers.values() if address in c.places]:
             self._lost(carrier)
-        if self.options.restart:
+        if self.options.keep:
             self.crew.restart(address)
 
     def _lost(self, carrier: _Carrier) -> None:
