@@ -91,7 +91,7 @@ def passes_in(path):
 def test_kills_of_workers_and_of_the_client_leave_the_same_picture(scene, tmp_path):
     """Five of workers, two of clients, at random times."""
     chance = random.Random(7)
-    passes = 900
+    passes = 400
     arguments = ["render", scene, "--passes", passes, "--spp", passes, "--quiet"]
     whole = process(*arguments, "-o", "whole.exr", cwd=tmp_path)
     assert whole.wait(timeout=900) == 0

@@ -102,6 +102,7 @@ def test_workers_render_the_same_picture_as_one_process(client):
     assert [what[0] for what in seen] == sorted(what[0] for what in seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("passes, spp", [(1, 3), (4, 10)])
 def test_passes_that_share_samples_unevenly_and_a_single_one(client, passes, spp):
     done = render(scene(passes=passes), client, spp=spp)
@@ -122,6 +123,7 @@ def test_files_travel_to_workers_whose_directory_has_none(client, spread):  # no
     assert not any(name.startswith("scene-") for names in left.values() for name in names)
 
 
+@pytest.mark.slow
 def test_a_state_goes_on_with_other_workers_and_with_none(client, tmp_path):
     path = tmp_path / "a.state"
     world = mi.load_dict(scene(), optimize=False)
@@ -138,16 +140,19 @@ def test_a_state_goes_on_with_other_workers_and_with_none(client, tmp_path):
     assert_same_picture(image, alone(scene(), 16, passes=8)[0])
 
 
+@pytest.mark.slow
 def test_an_error_that_is_aimed_at_ends_rendering(client):
     done = render(scene(), client, spp=4, target_error=0.2)
     assert done.statistics["relative_error"] <= 0.2
     assert 4 <= done.statistics["passes"] < 2000
 
 
+@pytest.mark.slow
 def test_time_ends_rendering_but_not_before_the_first_pass(client):
     assert 1 <= render(scene(), client, spp=2, time=1e-3).statistics["passes"] <= 8
 
 
+@pytest.mark.slow
 def test_asynchronous_clients_are_awaited(client):
     from distributed import Client
 
