@@ -14,7 +14,7 @@ import re
 import tarfile
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,22 +71,30 @@ class Parcel:
     def unpacked(self, directory: Path) -> Iterator[Path]:
         """The folder with the files, below ``directory``, as long as the block runs. Raises
         BadParcel, and OSError where there is no room."""
+        with ExitStack() as stack:
+            try:
+                directory.mkdir(parents=True, exist_ok=True)
+                made = tempfile.TemporaryDirectory(prefix="scene-", dir=directory)
+                folder = Path(stack.enter_context(made))
+                self._unpack(folder)
+            except OSError as error:
+                what = f"cannot unpack the scene: {error.strerror}"
+                raise OSError(error.errno, what, str(directory)) from error
+            yield folder
+
+    def _unpack(self, folder: Path) -> None:
         data = self.archive.tobytes()
         if hashlib.sha256(data).hexdigest() != self.sha256:
             raise BadParcel("the scene's archive was damaged on the way")
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="scene-", dir=directory) as name:
-            folder = Path(name)
-            with tarfile.open(fileobj=io.BytesIO(data)) as archive:
-                for member in archive:
-                    if not (member.isreg() and _ALLOWED.fullmatch(member.name)):
-                        raise BadParcel(f"the scene's archive names '{member.name}': refused")
-                    path = folder / member.name
-                    path.parent.mkdir(exist_ok=True)
-                    content = archive.extractfile(member)
-                    with open(path, "xb") as file:
-                        file.write(content.read() if content else b"")
-            yield folder
+        with tarfile.open(fileobj=io.BytesIO(data)) as archive:
+            for member in archive:
+                if not (member.isreg() and _ALLOWED.fullmatch(member.name)):
+                    raise BadParcel(f"the scene's archive names '{member.name}': refused")
+                path = folder / member.name
+                path.parent.mkdir(exist_ok=True)
+                content = archive.extractfile(member)
+                with open(path, "xb") as file:
+                    file.write(content.read() if content else b"")
 
     def load(self, directory: Path):
         """The scene as Mitsuba has it; unpacked below ``directory`` while it is loaded."""
