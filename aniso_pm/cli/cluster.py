@@ -38,8 +38,8 @@ def cluster(
     """How many passes a second so many workers would render, and what would limit them.
 
     By arithmetic, and by a simulation with workers of uneven speed that straggle and die. Costs are
-    those measured on two cores of a cloud machine (docs/clusters.md), or here with --measure, which
-    takes about a minute and a local cluster of two workers.
+    those of docs/clusters.md, or, with --measure, partly measured on this machine with a local
+    cluster of two workers, which takes some minutes.
     """
     from dataclasses import asdict, replace
 

@@ -38,6 +38,9 @@ class Costs:
     bandwidth       bytes a second between two machines.
     parcel          bytes of the scene with its files.
     startup         of a worker that joins: imports, scene, kernels.
+
+    Bytes and ``add_per_byte`` were measured; the other defaults are orders of magnitude, to be
+    replaced by ``aniso-pm cluster --measure`` and by what is known of the cluster.
     """
 
     pass_seconds: float = 0.4
@@ -45,10 +48,10 @@ class Costs:
     channels: int = 4
     task_overhead: float = 0.01
     task_client: float = 0.006
-    add_per_byte: float = 1.5e-9
+    add_per_byte: float = 1.9e-9
     home_per_byte: float = 1.5e-8
     bandwidth: float = 117e6
-    parcel: int = 2 << 20
+    parcel: int = 1 << 20
     startup: float = 15.0
 
     @property
@@ -116,7 +119,7 @@ def advice(costs: Costs, conditions: Conditions, first: str, busy: float) -> str
     """What to set, in a sentence."""
     if first == "client":
         every = math.ceil(costs.sum_bytes * (1 / costs.bandwidth + costs.home_per_byte) / 0.1)
-        return f"let sums come home every {every} s (--save-every) instead of each {busy:.0%}"
+        return f"let sums come home every {every} s (--save-every): it takes {busy:.0%} of its time"
     if first == "scheduler":
         seconds = math.ceil(2 * conditions.workers * costs.task_client)
         return f"tasks of {seconds} s (--task-seconds)"
