@@ -55,6 +55,7 @@ class Crew:
         self.refused: dict[str, str] = {}
         self._joining: dict[str, _Candidate] = {}
         self._known: set[str] = set()
+        self._slow: set[str] = set()
         self._looked = 0.0
         self._some = self._complete = time.monotonic()  # when there was last anybody, everybody
         self.job = None  # the job where workers can get it, sent once
@@ -79,13 +80,21 @@ class Crew:
         elif now - self._some > (_GRACE if self.refused else self._patience):
             raise Failed(self._nobody())
 
-    def refuse(self, address: str, reason: str) -> None:
-        """Use a worker no more."""
+    def refuse(self, address: str, reason: str, slow: bool = False) -> None:
+        """Use a worker no more. slow: it may come back (see ``readmit``)."""
+        if slow:
+            self._slow.add(address)
         if address in self.good or address in self._joining:
             self.good.pop(address, None)
             self._joining.pop(address, None)
             self.refused[address] = reason
             self._warn(f"worker {address} is not used: {reason}")
+
+    def readmit(self, address: str) -> None:
+        """Use a worker again that was slow, and not hanging."""
+        if address in self._slow and self.refused.pop(address, ""):
+            self.good[address] = {}
+        self._slow.discard(address)
 
     @property
     def allowed(self) -> list[str] | None:

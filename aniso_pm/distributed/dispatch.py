@@ -261,6 +261,8 @@ class _Dispatch:
         what, carrier = news["what"], self.carriers.get(news["task"])
         if what == "failed":
             self.crew.refuse(news["worker"], news["reason"])
+        elif what == "end":
+            self.crew.readmit(news["worker"])
         if carrier is None:
             return
         now = time.monotonic()
@@ -316,7 +318,7 @@ class _Dispatch:
 
     def _hangs(self, address: str, seconds: float) -> None:
         """What a worker has that hangs is lost."""
-        self.crew.refuse(address, f"a task has not ended in {seconds:.0f} seconds")
+        self.crew.refuse(address, f"a task has not ended in {seconds:.0f} seconds", slow=True)
         for carrier in [c for c in self.carriers.values() if address in c.places]:
             self._lost(carrier)
         if self.options.keep:
