@@ -57,6 +57,18 @@ class Sums:
         dr.eval(sums.first, square, cross)
         return sums
 
+    def joined(self, other: Sums) -> Sums:
+        """The sums over the passes of both."""
+        both = lambda a, b: None if a is None or b is None else a + b  # noqa: E731
+        sums = Sums(
+            self.shape,
+            self.first + other.first,
+            both(self.square, other.square),
+            both(self.cross, other.cross),
+        )
+        dr.eval(sums.first, sums.square, sums.cross)
+        return sums
+
     def film_tensor(self):
         """Σ A as the film's own storage has it (TensorXf)."""
         return mi.TensorXf(mi.Float(self.first), self.shape)
@@ -71,8 +83,8 @@ class Sums:
         """Inverse of :meth:`arrays`."""
         height, width, channels = map(int, arrays["first"].shape)
         shape = height, width, channels
-        names = ("first", "square", "cross")
-        return Sums(shape, *(own(mi.Float64, arrays[name].astype(float)) for name in names))
+        flat = {name: own(mi.Float64, array.astype(float)) for name, array in arrays.items()}
+        return Sums(shape, flat["first"], flat.get("square"), flat.get("cross"))
 
 
 def mean_and_variance(arrays: dict[str, np.ndarray], passes: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,11 @@ class InputError(Exception):
     """The user asked for something that cannot be done; the message is one line that says what."""
 
 
+class Failed(RuntimeError):
+    """Rendering cannot go on, for a reason outside of scene and parameters (workers that are gone,
+    for example); the message is one line that says what, and what to do."""
+
+
 # "[parser.cpp:444] " and "[PluginManager] ", where a message or a nested message starts
 _ORIGIN = re.compile(r"(^|:\s+|\n\s*)\[[A-Za-z_]\w*(?:\.(?:cpp|h|py):\d+)?\]\s+")
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -24,9 +24,9 @@ from .accumulate import Sums, mean_and_variance, relative_standard_error
 from .allotment import Allotment
 from .arrays import own
 from .clock import Clock
-from .errors import is_interrupt
+from .errors import Failed, is_interrupt
 from .eye import Thinning
-from .pilot import photons_per_path, settle
+from .pilot import Settled, photons_per_path, settle
 from .prepared import EYE, PROBE, THINNING, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
 from .stopping import Stopping
@@ -61,12 +61,33 @@ class Controls:
     callback    called as callback(pass_index, image, statistics) after every pass: the picture so
                 far as a tensor, and the statistics so far.
     checkpoint  where to keep the state.
+    settled     what a pilot has chosen, on another machine; None: one will choose here.
+    elsewhere   who renders the passes, if not this process: called with the ``Run``, gives them as
+                ``Batch``es. progress and callback are then called after each of those.
     """
 
     first_pass: int = 0
     progress: Callable[[float, int | None, str], None] | None = None
     callback: Callable[[int, Any, dict], None] | None = None
     checkpoint: state.Checkpoint | None = None
+    settled: Settled | None = None
+    elsewhere: Callable[[Run], Iterator[Batch]] | None = None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Passes that were rendered together.
+
+    passes   half-open ranges of their numbers (see ``state.State``).
+    arrays   ``Sums.arrays()`` of them.
+    counts   what they counted.
+    seconds  that each stage took.
+    """
+
+    passes: list[list[int]]
+    arrays: dict[str, np.ndarray]
+    counts: dict[str, int]
+    seconds: dict[str, float]
 
 
 @dataclass
@@ -89,17 +110,25 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
 
     Ctrl-C ends rendering: the film then holds all passes that were finished, or the wavefronts of
     the first one, and statistics["interrupted"] is True. It is raised on where there is nothing.
+    A ``Failed`` of those who render the passes ends it likewise; statistics["failure"] is its text.
     Raises state.StateError where the checkpoint's state is not one of this rendering.
     """
-    run = _Run(scene, sensor, seed, spp, controls, statistics)
+    run = Run(scene, sensor, seed, spp, controls, statistics)
     run.start()
     try:
-        for index in run.numbers():
-            run.render_pass(index)
+        if controls.elsewhere:
+            for batch in controls.elsewhere(run):
+                run.add(batch)
+        else:
+            for index in run.numbers():
+                run.render_pass(index)
     except BaseException as error:
-        if not is_interrupt(error) or not run.keep_unfinished():
+        failed = isinstance(error, Failed)
+        if not (failed or is_interrupt(error)) or not run.keep_unfinished():
             raise
         statistics["interrupted"] = True
+        if failed:
+            statistics["failure"] = str(error)
     finally:
         run.stopping.close()
     run.finish()
@@ -129,13 +158,14 @@ class _Room:
             self.room = count + count // 8
 
 
-class _Run:
+class Run:
     """One call of ``render``: what changes from pass to pass."""
 
     def __init__(self, scene, sensor, seed, spp, controls, statistics):
         self.scene, self.sensor, self.seed = scene, sensor, seed
         self.controls, self.statistics = controls, statistics
         self.film = sensor.film()
+        self.given, self.spp = scene.settings, spp
         spp = spp or sensor.sampler().sample_count()
         pixels = films.pixel_count(self.film)
         self.shares = shares(scene.settings, spp, pixels, controls.first_pass)
@@ -158,12 +188,15 @@ class _Run:
         # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
         exactly = known.get("samples per pixel of a pass")
         each = exactly or self.shares.each
-        found = settle(self.scene, self.sensor, self.seed, each, bool(exactly))
+        found = self.controls.settled or settle(
+            self.scene, self.sensor, self.seed, each, bool(exactly)
+        )
         self.shares = replace(self.shares, each=found.each)
         use = known.get("use of the map") or found.use
         count = settings.photon_count or known.get("photon count") or found.count
-        self.scene = replace(found, use=use, count=count).applied(self.scene)
         self.radius0 = settings.initial_radius or known.get("initial radius") or found.radius
+        self.found = found = replace(found, use=use, count=count, radius=self.radius0)
+        self.scene = found.applied(self.scene)
         self.share = None  # of the eye paths of each pixel that gather; None: all do
         if found.share.min() < 1:
             pixels = films.pixel_count(self.film)
@@ -217,7 +250,7 @@ class _Run:
         bound = min(s.depth_limit, s.rr_depth + 20) * s.photon_count if scene.needs_map else 0
         at_once = pixels * self._samples_at_once(self.shares.each + bool(self.shares.one_more))
         channels = self.film.create_block().channel_count()
-        job = memory.Job(bound, pixels, channels, self._keeps_variance(), at_once)
+        job = memory.Job(bound, pixels, channels, self.keeps_variance, at_once)
         return job, lambda: photons_per_path(scene, self.seed) * s.photon_count
 
     def _samples_at_once(self, spp: int) -> int:
@@ -225,9 +258,11 @@ class _Run:
         pixels = films.pixel_count(self.film)
         return max(1, min(spp, WAVEFRONT // self.scene.crowding // pixels))
 
-    def _keeps_variance(self) -> bool:
+    @property
+    def keeps_variance(self) -> bool:
         """Variances are worth their memory where there can be any, now or after a merge."""
-        return self.scene.settings.passes != 1 or self.controls.checkpoint is not None
+        kept = self.controls.checkpoint is not None or self.controls.settled is not None
+        return kept or self.scene.settings.passes != 1
 
     def _go_on_from(self, earlier: state.State):
         path = self.controls.checkpoint.path
@@ -277,7 +312,7 @@ class _Run:
             # --- One more pass is done ---
             sums = self.done.sums
             if sums is None:
-                sums = Sums.zeros(image.shape, self._keeps_variance())
+                sums = Sums.zeros(image.shape, self.keeps_variance)
             total = {name: n + counts.get(name, 1) for name, n in self.done.counts.items()}
             passes = state.extended(self.done.passes, index)
             self.done = _Done(sums.plus(image), passes, total)
@@ -289,6 +324,31 @@ class _Run:
             self.clock.lap("film")
             self._report(index, 1)
             self._after_pass(index)
+
+    def begin(self):
+        """Forget all passes that are done."""
+        self.done = _Done(None, [], dict.fromkeys(self.done.counts, 0))
+        self.clock.seconds.clear()
+
+    def batch(self) -> Batch:
+        """The passes since ``begin``."""
+        sums, passes, counts = self.done
+        return Batch(passes, sums.arrays(), counts, dict(self.clock.seconds))
+
+    def add(self, batch: Batch):
+        """Passes that were rendered elsewhere, and what is due after them."""
+        sums, passes, counts = self.done
+        more = Sums.from_arrays(batch.arrays)
+        sums = more if sums is None else sums.joined(more)
+        total = {name: n + batch.counts[name] for name, n in counts.items()}
+        self.done = _Done(sums, state.joined([*passes, *batch.passes]), total)
+        self.clock.go_on_from(batch.seconds)
+        last = self.done.passes[-1][1] - 1
+        self.radius = bandwidth(self.radius0, self.scene.settings.alpha, last)
+        self.statistics |= {**total, "radius": self.radius}
+        self._estimate_error()
+        self._report(last, 1)
+        self._after_pass(last)
 
     def _trace_pass(self, index: int):
         """(image as film blocks hold it, counts) of one pass."""
@@ -393,6 +453,14 @@ class _Run:
             number += f"/{self.controls.first_pass + self.scene.settings.passes}"
         text = number + (f", error {error:.2%}" if error else "")
         self.controls.progress(count + part if part < 1 else count, total, text)
+
+    def report_elsewhere(self, count: int):
+        """Tell that ``count`` passes are rendered, not all of which are here."""
+        if self.controls.progress:
+            error = self.statistics["relative_error"]
+            total = self.stopping.expected_total(count, error)
+            text = f"{count} passes" + (f", error {error:.2%}" if error else "")
+            self.controls.progress(count, total, text)
 
     def _after_pass(self, index: int):
         checkpoint, callback = self.controls.checkpoint, self.controls.callback

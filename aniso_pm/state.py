@@ -118,7 +118,7 @@ def merge(states: dict[str, State]) -> State:
         arrays = {k: v + state.arrays[k] for k, v in arrays.items()}
         statistics = add_counts(statistics, state.statistics)
         seconds += state.seconds
-    return State(first.identity, first.film, _joined(passes), seconds, statistics, arrays)
+    return State(first.identity, first.film, joined(passes), seconds, statistics, arrays)
 
 
 def numbers(passes):
@@ -128,7 +128,17 @@ def numbers(passes):
 
 def extended(passes: list[list[int]], number: int) -> list[list[int]]:
     """The ranges with one more pass."""
-    return _joined([*passes, [number, number + 1]])
+    return joined([*passes, [number, number + 1]])
+
+
+def missing(passes, first: int, count: int) -> list[list[int]]:
+    """Ranges of those passes from ``first`` to ``first + count - 1`` that are not in ``passes``."""
+    found, at = [], first
+    for start, end in [*joined(passes), [first + count, first + count]]:
+        if start > at:
+            found.append([at, min(start, first + count)])
+        at = max(at, end)
+    return [[a, b] for a, b in found if a < b]
 
 
 def describe(passes) -> str:
@@ -154,14 +164,15 @@ def _holds(passes, number: int) -> bool:
     return any(start <= number < end for start, end in passes)
 
 
-def _joined(passes) -> list[list[int]]:
-    joined: list[list[int]] = []
+def joined(passes) -> list[list[int]]:
+    """Disjoint ranges in order, those that touch as one."""
+    result: list[list[int]] = []
     for start, end in sorted(map(list, passes)):
-        if joined and joined[-1][1] == start:
-            joined[-1][1] = end
+        if result and result[-1][1] == start:
+            result[-1][1] = end
         else:
-            joined.append([start, end])
-    return joined
+            result.append([start, end])
+    return result
 
 
 def _checksum(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:

@@ -56,10 +56,19 @@ class Stopping:
 
     def _close_history(self):
         kernels = [k for k in dr.kernel_history() if "backend_time" in k]
-        self._compiling = sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
+        self._compiling += sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
         dr.set_flag(dr.JitFlag.KernelHistory, False)
         dr.kernel_history_clear()
         self._history = False
+
+    @property
+    def compiling(self) -> float:
+        """Seconds of compilation, and what else does not count, so far."""
+        return self._compiling
+
+    def not_counted(self, seconds: float):
+        """So many seconds since the beginning were no rendering."""
+        self._compiling += seconds
 
     def spent(self) -> float:
         """Seconds spent, earlier runs included, compilation not."""

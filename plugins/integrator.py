@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields
 from typing import Any
 
@@ -183,7 +183,8 @@ class AnisoPhotonMapper:
     (pass_index, image, statistics) that is called after each pass with the picture so far;
     ``checkpoint``, an ``aniso_pm.state.Checkpoint`` that keeps the state of the rendering in a file
     from which it can be resumed; ``first_pass``, the number of the first pass. Pass i is the same
-    whatever passes are rendered before or after it, or none.
+    whatever passes are rendered before or after it, or none; ``elsewhere``, who renders the passes
+    instead of this process (see ``aniso_pm.distributed``).
 
     In spectral variants all photons and eye paths of a pass share four wavelengths, stratified over
     the passes: give at least 16 passes.
@@ -232,6 +233,7 @@ class AnisoPhotonMapper:
         self.progress: Callable[[float, int | None, str], None] | None = None
         self.callback: Callable[[int, Any, dict], None] | None = None
         self.checkpoint: Checkpoint | None = None
+        self.elsewhere: Callable[[progressive.Run], Iterator[progressive.Batch]] | None = None
         self.first_pass = 0
         self._last_map: tuple | None = None
         self._exposed: dict[str, Any] = {}
@@ -261,7 +263,11 @@ class AnisoPhotonMapper:
         with dr.suspend_grad():
             prepared = prepare(scene, self.settings, self.hide_emitters)
             controls = progressive.Controls(
-                self.first_pass, self.progress, self.callback, self.checkpoint
+                self.first_pass,
+                self.progress,
+                self.callback,
+                self.checkpoint,
+                elsewhere=self.elsewhere,
             )
             done = progressive.render(
                 prepared, sensor, _as_int(seed), spp, controls, self.statistics

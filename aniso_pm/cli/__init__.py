@@ -14,9 +14,9 @@ from typing import Annotated
 import typer
 from aniso_pm import output
 from aniso_pm._version import __version__
-from aniso_pm.errors import InputError, is_interrupt, one_line
+from aniso_pm.errors import Failed, InputError, is_interrupt, one_line
 
-from . import bench, examine, explain, reference, render, report, scenes
+from . import bench, cluster, examine, explain, reference, render, report, scenes
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -33,6 +33,8 @@ def main(arguments: list[str] | None = None) -> int:
         return app(args=arguments, prog_name="aniso-pm", standalone_mode=False) or 0
     except (InputError, output.OutputError) as error:
         return _fail(2, str(error), error)
+    except Failed as error:
+        return _fail(1, str(error), error)
     except BrokenPipeError:
         # The reader of our output has left ("| head"): nobody to tell.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -85,5 +87,6 @@ for command in (
     examine.stability,
     examine.doctor,
     bench.bench,
+    cluster.cluster,
 ):
     app.command()(command)

@@ -25,6 +25,18 @@ from .common import (
     parse_defines,
     set_variant,
 )
+from .workers import (
+    Mixed,
+    Scheduler,
+    SchedulerFile,
+    TaskLimit,
+    TaskSeconds,
+    TlsCa,
+    TlsCert,
+    TlsKey,
+    Workers,
+    rendering_elsewhere,
+)
 
 
 def render(
@@ -59,6 +71,15 @@ def render(
         float, typer.Option(min=0, help="Seconds between savings of picture and state.")
     ] = 30.0,
     sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    scheduler_file: SchedulerFile = None,
+    mixed: Mixed = False,
+    task_seconds: TaskSeconds = 5.0,
+    task_limit: TaskLimit = None,
+    tls_ca_file: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no warnings.")] = False,
     as_json: Annotated[
@@ -75,6 +96,10 @@ def render(
     saved again and again; --resume goes on from there. Finished pictures lose their state unless
     --resume or --keep-state was given. Passes 8 to 15 of a picture, to be merged with passes 0 to
     7, are --first-pass 8 --passes 8 with the same samples per pass.
+
+    --workers 4 renders the passes in four processes of this machine, --scheduler or
+    --scheduler-file on the workers of a Dask cluster, with the same picture. Whoever can reach a
+    Dask scheduler can run code on its workers: use TLS, or a network of your own.
     """
     # --- Find out what would fail, before anything slow ---
     defines = parse_defines(define or [])
@@ -118,7 +143,22 @@ def render(
             integrator.checkpoint = Checkpoint(state_file, save_every, resume, write)
             if resume and not state_file.exists() and not quiet:
                 print(f"aniso-pm: no state '{state_file}' yet, starting afresh", file=sys.stderr)
-        _render(world, camera, integrator, seed, spp, quiet)
+        with rendering_elsewhere(
+            integrator,
+            scene,
+            defines,
+            sensor,
+            workers,
+            scheduler,
+            scheduler_file,
+            {"ca_file": tls_ca_file, "client_cert": tls_cert, "client_key": tls_key},
+            mixed=mixed,
+            task_seconds=task_seconds,
+            task_limit=task_limit,
+            # As often as the picture is saved.
+            home_every=max(save_every, 1.0),
+        ):
+            _render(world, camera, integrator, seed, spp, quiet)
         record = write()
         statistics = record["statistics"]
         if kept is False and not statistics["interrupted"]:
@@ -129,6 +169,13 @@ def render(
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
     elif not quiet:
         print(_done(record, out, picture))
+    if statistics.get("failure"):
+        done = f"{statistics['passes']} passes" if statistics["passes"] else "part of a pass"
+        print(
+            f"aniso-pm: error: {statistics['failure']}; the picture so far ({done}) is written",
+            file=sys.stderr,
+        )
+        return 1
     if statistics.get("interrupted"):
         print("aniso-pm: interrupted, the picture so far is written", file=sys.stderr)
         return INTERRUPTED
@@ -138,6 +185,12 @@ def render(
 def merge(
     states: Annotated[list[Path], typer.Argument(help="States (.state), or their pictures.")],
     out: Annotated[Path, typer.Option("--output", "-o", help="Picture to write (.exr).")],
+    passes: Annotated[
+        int | None, typer.Option(min=1, max=10**7, help="Say which of so many passes are missing.")
+    ] = None,
+    first_pass: Annotated[
+        int, typer.Option(min=0, max=10**7, help="Number of the first of those.")
+    ] = 0,
     png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
@@ -147,10 +200,11 @@ def merge(
 
     Writes the picture and, beside it, the state of all passes, from which it can be merged again
     or resumed. All must have the same scene, parameters, seed and samples per pass, and no pass
-    may occur twice.
+    may occur twice. Jobs that still render may be merged, too: with what they have so far. --passes
+    tells on standard error which passes are missing from the picture.
     """
     from aniso_pm import film as films
-    from aniso_pm.state import State, StateError
+    from aniso_pm.state import State, StateError, describe, missing
     from aniso_pm.state import merge as merged
 
     if out.suffix.lower() != ".exr":
@@ -159,13 +213,16 @@ def merge(
     for path in filter(None, [out, picture]):
         output.check_writable(path)
     try:
-        loaded = {}
-        for name in states:
-            path = name.with_suffix(".state") if name.suffix.lower() == ".exr" else name
-            if str(path) in loaded:
-                raise InputError(f"{path}: named twice")
-            loaded[str(path)] = State.load(path)
-        total = merged(loaded)
+        loaded = [
+            str(name.with_suffix(".state") if name.suffix.lower() == ".exr" else name)
+            for name in states
+        ]
+        for file in loaded:
+            if loaded.count(file) > 1:
+                raise InputError(f"{file}: named twice")
+        total = State.load(Path(loaded[0]))
+        for file in loaded[1:]:  # one after the other: there may be thousands of large ones
+            total = merged({loaded[0]: total, file: State.load(Path(file))})
     except StateError as error:
         raise InputError(str(error)) from error
     except OSError as error:
@@ -178,8 +235,9 @@ def merge(
         raise InputError(str(error)) from error
     films.show_array(film, total.arrays["first"])
     record = {
-        "merged": list(loaded),
+        "merged": loaded,
         "passes": total.passes,
+        "missing": missing(total.passes, first_pass, passes) if passes else None,
         "seed": total.identity["seed"],
         "variant": total.identity["variant"],
         "statistics": total.statistics,
@@ -189,6 +247,12 @@ def merge(
     if picture:
         output.write_png(film, picture)
     total.save(out.with_suffix(".state"))
+    if record["missing"]:
+        count = sum(end - start for start, end in record["missing"])
+        print(
+            f"aniso-pm: {count} of {passes} passes are missing: {describe(record['missing'])}",
+            file=sys.stderr,
+        )
     if as_json:
         record |= {"output": str(out), "png": str(picture) if picture else None}
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))

@@ -1,0 +1,102 @@
+"""Options of ``aniso-pm render`` that let the workers of a Dask cluster render."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from aniso_pm.errors import InputError
+
+Workers = Annotated[
+    int | None,
+    typer.Option(min=1, max=4096, help="Render in so many processes on this machine."),
+]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Render on this Dask scheduler's workers.")
+]
+SchedulerFile = Annotated[
+    Path | None,
+    typer.Option("--scheduler-file", help="Likewise; the file that the scheduler has written."),
+]
+Mixed = Annotated[
+    bool, typer.Option("--mixed", help="Let LLVM and CUDA workers render one picture.")
+]
+TaskSeconds = Annotated[
+    float, typer.Option("--task-seconds", min=0.01, help="Seconds that a worker's task takes.")
+]
+TaskLimit = Annotated[
+    float | None,
+    typer.Option("--task-limit", min=0.1, help="Seconds after which a worker's task has hung."),
+]
+TlsCa = Annotated[Path | None, typer.Option("--tls-ca-file", help="CA file, as of `dask worker`.")]
+TlsCert = Annotated[Path | None, typer.Option("--tls-cert", help="Certificate, likewise.")]
+TlsKey = Annotated[Path | None, typer.Option("--tls-key", help="Key, likewise.")]
+
+
+# Seconds for processes of this machine to start, or to be started again, however busy it is.
+_LOCAL_PATIENCE = 180.0
+
+
+@contextmanager
+def rendering_elsewhere(
+    integrator,
+    scene: Path,
+    defines: dict[str, str],
+    sensor: int,
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_file: Path | None,
+    tls: dict[str, Path | None],
+    **options,
+) -> Iterator[None]:
+    """Let ``integrator`` render on workers inside the block, if they are asked for.
+
+    options: of ``distributed.Options``.
+    """
+    ways = {"--workers": workers, "--scheduler": scheduler, "--scheduler-file": scheduler_file}
+    asked = [name for name, value in ways.items() if value]
+    tls_given = {f"tls_{name}": str(path) for name, path in tls.items() if path}
+    if len(asked) > 1:
+        raise InputError(f"{' and '.join(asked)}: give one of them")
+    if not scheduler and not scheduler_file:
+        others = [name for name, given in (("--tls-…", tls_given),) if given]
+        if not workers:
+            others += ["--mixed"] * bool(options["mixed"])
+            others += ["--task-limit"] * bool(options["task_limit"])
+        if others:
+            raise InputError(f"{', '.join(others)}: only with --scheduler or --scheduler-file")
+    if not asked:
+        yield
+        return
+    if not hasattr(integrator, "elsewhere"):
+        raise InputError(f"{asked[0]}: {integrator.class_name()} renders in this process only")
+
+    from aniso_pm.distributed.cluster import connected, local, require
+
+    require()
+    from aniso_pm.distributed import Elsewhere, Options, Parcel
+
+    if integrator.settings.passes == 1:
+        warn(f"{asked[0]}: a single pass is one worker's work; give --passes, or --time")
+    parcel = Parcel.of(scene, defines)
+    if workers:
+        place = local(workers)
+    else:
+        place = connected(scheduler, scheduler_file, tls_given)
+    with place as client:
+        patience = _LOCAL_PATIENCE if workers else Options.patience
+        chosen = Options(keep=workers or 0, patience=patience, **options)
+        integrator.elsewhere = Elsewhere(client, parcel, sensor, chosen, warn)
+        try:
+            yield
+        finally:
+            integrator.elsewhere = None
+
+
+def warn(text: str) -> None:
+    """On standard error."""
+    print(f"aniso-pm: warning: {text}", file=sys.stderr)

@@ -1,0 +1,441 @@
+"""Passes handed out to workers, added up there, and brought home: the loop of the client.
+
+A *carrier* is something on the cluster that stands for passes: a task that renders them, or a sum
+of several carriers. One rule covers all that can go wrong: a carrier that fails, is lost, or takes
+too long gives its passes back to the ledger, and somebody else renders them. Dask itself renders
+again what a worker had that died.
+
+Results of a worker are added up where they are, as soon as there are two, so that it holds few
+pictures however many passes it has rendered. Now and then all sums go through a tree of additions,
+and the client gets one.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import time
+import uuid
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import mitsuba as mi
+from aniso_pm import digest
+from aniso_pm.errors import Failed, is_interrupt, one_line
+from aniso_pm.progressive import Batch, Run
+
+from . import worker
+from .crew import Crew, gone
+from .ledger import Ledger
+from .pace import Pace
+from .parcel import Parcel
+
+# Sums that one addition of the tree takes.
+_ARITY = 4
+# Tasks per worker: one that it renders, one that waits.
+_AHEAD = 2
+# Seconds for the last sums to come home when rendering was interrupted.
+_SALVAGE = 10.0
+# Groups of deaths (Dask counts each task's) without one finished task, after which it is given up.
+_DEATHS = 3
+# Where an error is aimed at, or a state is due to be saved, sums come home so often at most: share
+# of the time, and seconds.
+_HOME_SHARE, _HOME_LEAST = 0.05, 1.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to use a cluster.
+
+    task_seconds  that a task should take: several passes, where they are short.
+    task_limit    seconds after which a task counts as hung and is rendered elsewhere; None: ten
+                  times what it should take, and at least a minute.
+    patience      seconds to wait for a first worker, or for another when all are gone.
+    home_every    seconds after which sums come home, at the latest.
+    mixed         may LLVM and CUDA workers render the same picture?
+    keep          workers that a cluster of one's own has: those that hang, or are lost, are started
+                  again. 0: the cluster is that of somebody else.
+    """
+
+    task_seconds: float = 5.0
+    task_limit: float | None = None
+    patience: float = 30.0
+    home_every: float = 30.0
+    mixed: bool = False
+    keep: int = 0
+
+    def __post_init__(self):
+        for name in ("task_seconds", "task_limit", "patience", "home_every"):
+            value = getattr(self, name)
+            if value is not None and not (0 < value < math.inf):
+                raise ValueError(f"{name} is {value}; it must be a positive number of seconds")
+
+
+@dataclass
+class _Carrier:
+    """What stands for passes. due: when to give up; places: workers that it, or its parts, are on,
+    as far as known."""
+
+    key: str
+    future: Any
+    passes: int
+    due: float
+    renders: bool
+    places: frozenset[str] = frozenset()
+    done: bool = False
+    started: float | None = None
+
+
+class Elsewhere:
+    """Renders passes on the workers of a Dask cluster: what ``Controls.elsewhere`` takes.
+
+    client  a blocking ``distributed.Client``.
+    parcel  the scene; sensor: number of its camera.
+    warn    called with a sentence about each worker that is not used.
+    """
+
+    def __init__(
+        self,
+        client,
+        parcel: Parcel,
+        sensor: int = 0,
+        options: Options | None = None,
+        warn: Callable[[str], None] = lambda text: mi.Log(mi.LogLevel.Warn, f"aniso_pm: {text}"),
+    ):
+        self.client, self.parcel, self.sensor = client, parcel, sensor
+        self.options, self.warn = options or Options(), warn
+
+    def __call__(self, run: Run) -> Iterator[Batch]:
+        return _Dispatch(self, run).batches()
+
+    def job(self, run: Run) -> worker.Job:
+        """What workers have to know."""
+        scene = run.scene
+        return worker.Job(
+            f"aniso_pm-{uuid.uuid4().hex[:12]}",
+            self.parcel,
+            worker.versions(),
+            mi.variant(),
+            digest.scene_entries(scene.scene) | digest.camera_entries(run.sensor),
+            self.options.mixed,
+            {
+                # As given: what was chosen is in ``settled``.
+                "settings": asdict(run.given),
+                "hide_emitters": scene.hide_emitters,
+                "sensor": self.sensor,
+                "seed": run.seed,
+                "spp": run.spp,
+                "first_pass": run.controls.first_pass,
+                "settled": worker.shrunk(run.found),
+                "variance": run.keeps_variance,
+            },
+        )
+
+
+class _Dispatch:
+    """One rendering."""
+
+    def __init__(self, elsewhere: Elsewhere, run: Run):
+        self.run, self.client, self.options = run, elsewhere.client, elsewhere.options
+        self.job = elsewhere.job(run)
+        patience, keep = self.options.patience, self.options.keep
+        self.crew = Crew(self.client, self.job, patience, keep, elsewhere.warn)
+        self.pace = Pace(self.options.task_seconds, self.options.task_limit)
+        first, count = run.controls.first_pass, run.scene.settings.passes
+        self.ledger = Ledger(first, count, run.done.passes)
+        self.carriers: dict[str, _Carrier] = {}
+        self.homing: _Carrier | None = None  # the sum of all, on its way home
+        self.events: queue.SimpleQueue = queue.SimpleQueue()
+        self.began = self.home = time.monotonic()
+        self.home_cost = 0.0
+        self.enough = False
+        self.number = self.deaths = 0
+
+    def batches(self) -> Iterator[Batch]:
+        """Sums as they come home."""
+        self.run.stopping.close()  # the pilot's kernels are compiled
+        self.client.subscribe_topic(self.job.name, lambda event: self.events.put(event[1]))
+        try:
+            yield from self._loop()
+        except BaseException as error:
+            if isinstance(error, Failed) or is_interrupt(error):
+                yield from self._salvaged()
+            raise
+        finally:
+            self._close()
+
+    def _loop(self) -> Iterator[Batch]:
+        while not self.ledger.finished:
+            self._check_scheduler()
+            self.crew.update()
+            self._decide()
+            self._hand_out()
+            self._hear(0.5)
+            self._give_up_late()
+            self._unite()
+            if self._home_is_due():
+                self._go_home()
+            yield from self._homecoming()
+            if self.enough and not self.carriers:
+                return
+
+    # --- Handing out ---
+
+    @property
+    def rendering(self) -> list[_Carrier]:
+        return [c for c in self.carriers.values() if c.renders and not c.done]
+
+    @property
+    def rendered(self) -> int:
+        """Passes that are done, here or on the workers."""
+        there = sum(c.passes for c in self.carriers.values() if c.done or not c.renders)
+        return self.run.done.counts["passes"] + there
+
+    def _decide(self) -> None:
+        """Is it enough?"""
+        error = self.run.statistics["relative_error"]
+        if not self.enough and self.run.stopping.reached(self.rendered, error):
+            self.enough = True
+            # What has begun may end, if it does so in the time of one task; the rest is not needed.
+            for carrier in self.rendering:
+                if carrier.started is None:
+                    self._drop(carrier)
+                else:
+                    expected = carrier.passes * (self.pace.each or 0)
+                    carrier.due = min(carrier.due, time.monotonic() + max(1.0, expected))
+
+    def _hand_out(self) -> None:
+        if self.enough or not self.crew.good:
+            return
+        workers = len(self.crew.good)
+        while (ahead := len(self.rendering)) < _AHEAD * workers:
+            count = self.pace.passes(self.ledger.left, workers, self._seconds_left(workers))
+            if count == 0 and not (ahead or self.rendered):
+                count = 1  # the first pass is rendered whatever the time
+            key = f"render-{self.job.name}-{self.number}"
+            if not self.ledger.take(key, count):
+                return
+            self.number += 1
+            future = self.client.submit(
+                worker.render,
+                self.crew.job,
+                self.ledger.carried[key],
+                key,
+                key=key,
+                workers=self.crew.allowed,
+            )
+            # Behind others it has to wait.
+            due = time.monotonic() + 3 * _AHEAD * self.pace.limit(count)
+            self._watch(_Carrier(key, future, count, due, True))
+
+    def _seconds_left(self, workers: int) -> float:
+        """For a task that begins when what was handed out is done."""
+        limit = self.run.scene.settings.time
+        if not limit:
+            return math.inf
+        if self.began:
+            return limit
+        ahead = sum(c.passes for c in self.rendering) * (self.pace.each or 0) / workers
+        return limit - self.run.stopping.spent() - ahead
+
+    def _watch(self, carrier: _Carrier) -> None:
+        self.carriers[carrier.key] = carrier
+        tell = {"what": "done", "task": carrier.key}
+        carrier.future.add_done_callback(lambda _: self.events.put(tell))
+
+    # --- Hearing ---
+
+    def _hear(self, seconds: float) -> None:
+        """Wait for news, and take in all there are."""
+        try:
+            self._take(self.events.get(timeout=seconds))
+            while True:
+                self._take(self.events.get_nowait())
+        except queue.Empty:
+            pass
+        self.run.report_elsewhere(self.rendered)
+
+    def _take(self, news: dict[str, Any]) -> None:
+        what, carrier = news["what"], self.carriers.get(news["task"])
+        if what == "failed":
+            self.crew.refuse(news["worker"], news["reason"])
+        elif what == "end":
+            self.crew.readmit(news["worker"])
+        if carrier is None:
+            return
+        now = time.monotonic()
+        if what == "start":
+            if self.began:  # the time for processes to start and to load the scene does not count
+                self.run.stopping.not_counted(now - self.began)
+                self.began = 0.0
+            carrier.places, carrier.started = frozenset([news["worker"]]), now
+            carrier.due = now + self.pace.limit(carrier.passes)
+        elif what == "end":
+            if self.pace.each is None:
+                self.run.stopping.not_counted(news["compiling"])
+            carrier.places = frozenset([news["worker"]])
+            self.pace.seen(news["seconds"], carrier.passes, news["first"])
+        elif what == "done":
+            self._done(carrier)
+
+    def _done(self, carrier: _Carrier) -> None:
+        if carrier.future.status == "finished":
+            carrier.done, carrier.due, self.deaths = True, math.inf, 0
+            return
+        if carrier.future.status == "error":
+            error = carrier.future.exception()
+            if type(error).__name__ == "KilledWorker":
+                self.deaths += 1
+                if self.deaths >= _DEATHS:
+                    raise Failed(
+                        "workers die again and again while they render (is there memory enough? "
+                        f"see the workers' logs): {one_line(error)}"
+                    )
+            elif carrier.renders:
+                for address in carrier.places:
+                    self.crew.refuse(address, f"{type(error).__name__}: {one_line(error)}")
+        self._lost(carrier)
+
+    def _give_up_late(self) -> None:
+        """Carriers that take too long are lost; a worker that hangs is not used any more."""
+        now, rendering = time.monotonic(), self.rendering
+        idle = self.ledger.left == 0 and len(rendering) < len(self.crew.good)
+        for carrier in list(self.carriers.values()):
+            due = carrier.due
+            if idle and carrier.renders and carrier.started and not carrier.done:
+                due = min(due, carrier.started + self.pace.limit(carrier.passes, idle=True))
+            if now < due:
+                continue
+            self._lost(carrier)
+            if self.enough:
+                continue
+            self.pace.too_long()
+            if carrier.renders and carrier.started:
+                for address in carrier.places:
+                    self._hangs(address, now - carrier.started)
+
+    def _hangs(self, address: str, seconds: float) -> None:
+        """What a worker has that hangs is lost."""
+        self.crew.refuse(address, f"a task has not ended in {seconds:.0f} seconds", slow=True)
+        for carrier in [c for c in self.carriers.values() if address in c.places]:
+            self._lost(carrier)
+        if self.options.keep:
+            self.crew.restart(address)
+
+    def _lost(self, carrier: _Carrier) -> None:
+        self.ledger.give_back(carrier.key)
+        self._drop(carrier)
+
+    def _drop(self, carrier: _Carrier) -> None:
+        self.ledger.give_back(carrier.key)
+        self.carriers.pop(carrier.key, None)
+        if self.homing is carrier:
+            self.homing = None
+        carrier.future.release()
+
+    # --- Adding up ---
+
+    def _unite(self) -> None:
+        """Two results of the same worker become one, where they are."""
+        by_worker = defaultdict(list)
+        for carrier in self.carriers.values():
+            if carrier.done and carrier is not self.homing and len(carrier.places) == 1:
+                by_worker[carrier.places].append(carrier)
+        for several in by_worker.values():
+            if len(several) > 1:
+                self._sum(several)
+
+    def _sum(self, several: list[_Carrier]) -> _Carrier:
+        """A carrier that is the sum of others, by a tree of additions in the order of passes."""
+        several = sorted(several, key=lambda c: self.ledger.carried[c.key][0][0])
+        layer = [carrier.future for carrier in several]
+        while True:
+            groups = [layer[k : k + _ARITY] for k in range(0, len(layer), _ARITY)]
+            layer = [self._addition(group) for group in groups]
+            if len(layer) == 1:
+                break
+        future, passes = layer[0], sum(carrier.passes for carrier in several)
+        self.ledger.unite(future.key, [carrier.key for carrier in several])
+        for carrier in several:
+            del self.carriers[carrier.key]
+        due = time.monotonic() + 3 * self.pace.limit(1)
+        places = frozenset().union(*(carrier.places for carrier in several))
+        self._watch(_Carrier(future.key, future, passes, due, False, places))
+        return self.carriers[future.key]
+
+    def _addition(self, futures: list):
+        if len(futures) == 1:
+            return futures[0]
+        self.number += 1
+        key = f"add-{self.job.name}-{self.number}"
+        return self.client.submit(
+            worker.add, *futures, key=key, workers=self.crew.allowed, priority=10
+        )
+
+    # --- Coming home ---
+
+    def _home_is_due(self) -> bool:
+        if self.homing or not any(carrier.done for carrier in self.carriers.values()):
+            return False
+        if (self.enough or self.ledger.left == 0) and all(c.done for c in self.carriers.values()):
+            return True
+        every, checkpoint = self.options.home_every, self.run.controls.checkpoint
+        if self.run.scene.settings.target_error or (checkpoint and checkpoint.due()):
+            every = min(every, max(_HOME_LEAST, self.home_cost / _HOME_SHARE))
+        return time.monotonic() - self.home > every
+
+    def _go_home(self) -> None:
+        ready = [carrier for carrier in self.carriers.values() if carrier.done]
+        self.homing = self._sum(ready) if len(ready) > 1 else ready[0]
+        self.home = time.monotonic()
+
+    def _homecoming(self) -> Iterator[Batch]:
+        """The sum of all, if it is ready to be fetched."""
+        carrier = self.homing
+        if carrier is None or not carrier.done:
+            return
+        if carrier.future.status == "pending":  # its worker has died, Dask renders it again
+            carrier.done, carrier.due = False, time.monotonic() + 3 * self.pace.limit(1)
+            self._watch(carrier)
+            return
+        self.homing = None
+        try:
+            found = carrier.future.result(timeout=max(60.0, self.pace.limit(1)))
+        except Exception as error:
+            if is_interrupt(error):
+                raise
+            self._lost(carrier)
+            return
+        if self.ledger.count(carrier.key):
+            yield Batch(**found)
+        self._drop(carrier)
+        self.home_cost = time.monotonic() - self.home
+        self.home = time.monotonic()
+
+    def _salvaged(self) -> Iterator[Batch]:
+        """What is ready on the workers, if it comes soon."""
+        until = time.monotonic() + _SALVAGE
+        try:
+            for carrier in self.rendering:
+                self._drop(carrier)
+            while self.carriers and time.monotonic() < until and self.client.status == "running":
+                self._unite()
+                if not self.homing and all(c.done for c in self.carriers.values()):
+                    self._go_home()
+                yield from self._homecoming()
+                self._hear(0.1)
+        except (Failed, OSError):
+            return  # nothing more to be had
+
+    def _check_scheduler(self) -> None:
+        if self.client.status != "running":
+            raise Failed(gone(self.client))
+
+    def _close(self) -> None:
+        for carrier in list(self.carriers.values()):
+            carrier.future.release()
+        self.crew.close()
+        if self.client.status == "running":
+            self.client.unsubscribe_topic(self.job.name)
