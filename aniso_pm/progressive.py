@@ -26,6 +26,7 @@ from .arrays import own
 from .clock import Clock
 from .errors import is_interrupt
 from .eye import Thinning
+from .layered import Layered
 from .pilot import photons_per_path, settle
 from .prepared import EYE, PROBE, THINNING, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
@@ -73,12 +74,13 @@ class Controls:
 class Rendered:
     """What is left of a rendering beside the film: the scene with what was chosen for it, map and
     radius of the last pass (None if no pass was rendered), variance of the picture (None with one
-    pass)."""
+    pass), sums of the layers that were asked for (see ``layered``; None: none were)."""
 
     scene: Prepared
     map: Any
     radius: float | None
     variance: np.ndarray | None
+    layers: np.ndarray | None
 
 
 def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, statistics: dict):
@@ -105,7 +107,7 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
     run.finish()
     advice.after(scene, statistics)
     decided = replace(run.scene.thawed(), footprint=None)
-    return Rendered(decided, run.map, run.radius, run.variance)
+    return Rendered(decided, run.map, run.radius, run.variance, run.done.layers)
 
 
 class _Done(NamedTuple):
@@ -114,6 +116,7 @@ class _Done(NamedTuple):
     sums: Sums | None
     passes: list[list[int]]
     counts: dict[str, int]
+    layers: np.ndarray | None = None
 
 
 class _Room:
@@ -144,7 +147,9 @@ class _Run:
         self.map = self.radius = self.variance = None
         self.done = _Done(None, [], dict.fromkeys((*_COUNTS, "passes"), 0))
         self.photons, self.points = _Room(), _Room()
-        self.unfinished = None  # (image, counts) of the pass that is being rendered
+        self.layered = Layered.of(self.film, scene.settings.layer_names)
+        self.layers: np.ndarray | None = None  # of the pass that is being rendered
+        self.unfinished = None  # (image, counts, layers) of the pass that is being rendered
 
     # --- Before the first pass ---
 
@@ -217,6 +222,7 @@ class _Run:
         bound = min(s.depth_limit, s.rr_depth + 20) * s.photon_count if scene.needs_map else 0
         at_once = pixels * self._samples_at_once(self.shares.each + bool(self.shares.one_more))
         channels = self.film.create_block().channel_count()
+        channels += self.layered.channels if self.layered else 0
         job = memory.Job(bound, pixels, channels, self._keeps_variance(), at_once)
         return job, lambda: photons_per_path(scene, self.seed) * s.photon_count
 
@@ -241,7 +247,8 @@ class _Run:
                 f"but passes {wanted} are asked for"
             )
         counts = {name: earlier.statistics[name] for name in self.done.counts}
-        self.done = _Done(Sums.from_arrays(earlier.arrays), earlier.passes, counts)
+        sums, layers = Sums.from_arrays(earlier.arrays), earlier.arrays.get("layers")
+        self.done = _Done(sums, earlier.passes, counts, layers)
         self.stopping.spent_before = earlier.seconds
         self.statistics |= counts
         self.clock.go_on_from(earlier.statistics["seconds"])
@@ -280,7 +287,10 @@ class _Run:
                 sums = Sums.zeros(image.shape, self._keeps_variance())
             total = {name: n + counts.get(name, 1) for name, n in self.done.counts.items()}
             passes = state.extended(self.done.passes, index)
-            self.done = _Done(sums.plus(image), passes, total)
+            layers = self.layers
+            if layers is not None and self.done.layers is not None:
+                layers = self.done.layers + layers
+            self.done = _Done(sums.plus(image), passes, total, layers)
             self.unfinished = None
             self.statistics |= {**total, "radius": self.radius}
             estimate = self.plan.with_stored(self.photons.most).bytes / memory.GIB
@@ -293,7 +303,7 @@ class _Run:
     def _trace_pass(self, index: int):
         """(image as film blocks hold it, counts) of one pass."""
         # --- Photons ---
-        self.unfinished = None
+        self.unfinished = self.layers = None
         self.radius = bandwidth(self.radius0, self.scene.settings.alpha, index)
         colour = wavelength_sample(self.seed, index)
         wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
@@ -309,7 +319,7 @@ class _Run:
         # --- Eye paths ---
         share = self.shares(index)
         for image, done in self._eye_pass(index, share, colour, counts):
-            self.unfinished = image, dict(counts)
+            self.unfinished = image, dict(counts), self.layers
             if done < 1:
                 self._report(index, done)
         counts["spp"] = share
@@ -343,7 +353,9 @@ class _Run:
                 scene = replace(scene, footprint=pixel.seen_by(lanes.pixel))
             seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
             room = self.points.room
-            seen = scene.radiance(sampler, ray, map_, radius, seed, room, self.clock.lap, thinning)
+            seen = scene.radiance(
+                sampler, ray, map_, radius, seed, room, self.clock.lap, thinning, True
+            )
             self._count(seen.gathered, counts)
 
             # --- Into the image ---
@@ -353,6 +365,11 @@ class _Run:
             splats = films.splat(film, position, L, seen.valid, each, ray.wavelengths, lanes.weight)
             image = splats if image is None else image + splats
             dr.eval(image)
+            if self.layered is not None:
+                found = self.layered.wavefront(
+                    position, seen.seen, seen.gathered, ray, ray_weight, lanes, finite, each
+                )
+                self.layers = found if self.layers is None else self.layers + found
             self.clock.lap("film")
             counts["eye_samples"] += lanes.count
             counts["spp"] = int(spp * done)
@@ -416,7 +433,8 @@ class _Run:
             self.done.passes,
             self.stopping.spent(),
             self.statistics,
-            self.done.sums.arrays(),
+            self.done.sums.arrays()
+            | ({} if self.done.layers is None else {"layers": self.done.layers}),
         )
 
     # --- At the end ---
@@ -425,9 +443,9 @@ class _Run:
         """After an interruption: is there a picture? Whole passes only, or the wavefronts of the
         first one."""
         if self.done.sums is None and self.unfinished is not None:
-            image, counts = self.unfinished
+            image, counts, layers = self.unfinished
             sums = Sums.zeros(image.shape, False).plus(image)
-            self.done = _Done(sums, [], counts | {"passes": 0})
+            self.done = _Done(sums, [], counts | {"passes": 0}, layers)
         return self.done.sums is not None
 
     def finish(self):

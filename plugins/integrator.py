@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm import progressive
+from aniso_pm.layered import develop
 from aniso_pm.pilot import USUAL, automatic_radius
 from aniso_pm.prepared import Unsupported, prepare
 from aniso_pm.settings import Settings
@@ -156,6 +157,18 @@ class AnisoPhotonMapper:
          first pass. An estimate: the peak may be half as much again. 0 takes three quarters of what
          is available, to this process's control group or on the CUDA device. (Default: 0)
 
+     * - layers
+       - |string|
+       - Layers that are kept beside the picture, separated by commas. Light by how it came, the sum
+         of which is the picture: ``direct`` (emitters that are seen, and what they light directly),
+         ``caustic`` (over glass, mirrors and smooth metal alone) and ``indirect`` (the rest), each
+         at the first receiver that the eye path meets. What is seen: ``albedo`` and ``normal``
+         (world space) at that receiver, through mirrors, glass and glossy metal; ``depth``
+         (distance from the camera) and ``position`` of the first surface. What was done:
+         ``samples`` of each pixel, mean ``radius`` of its kernels (world units), and
+         ``standard_error`` (two passes or more). They are in the attribute ``layers``, and in the
+         EXR that :monosp:`aniso-pm render` writes. (Default: none)
+
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: |false|)
@@ -165,10 +178,12 @@ class AnisoPhotonMapper:
     surfaces, the diffuse part of ``plastic`` and ``roughplastic``, and surfaces whose roughness is
     at least ``gather_roughness``. Photons and eye paths walk on all others, as ``path`` does.
 
-    After ``render()`` the attribute ``statistics`` holds counts and timings. After two passes or
-    more ``variance`` holds the variance of the picture (NumPy array, height × width × channels),
-    estimated from the spread of the passes; its root is the standard error. Passes share one
-    stratified sequence, so that their mean is better than their spread says: an upper estimate.
+    After ``render()`` the attribute ``statistics`` holds counts and timings, and ``layers`` the
+    layers that were asked for, NumPy arrays (height × width × 1 or 3 channels) by name. After two
+    passes or more ``variance`` holds the variance of the picture (NumPy array, height × width ×
+    channels), estimated from the spread of the passes; its root is the standard error. Passes
+    share one stratified sequence, so that their mean is better than their spread says: an upper
+    estimate.
 
     Eye paths take their random numbers from an ``owen_sobol`` sequence that goes on from pass to
     pass, whatever the sampler of the scene, which says only how many samples there are. That number
@@ -229,6 +244,7 @@ class AnisoPhotonMapper:
         self.settings = Settings(**given)
         self.statistics: dict[str, Any] = {}
         self.variance: np.ndarray | None = None
+        self.layers: dict[str, np.ndarray] = {}
         self.progress: Callable[[float, int | None, str], None] | None = None
         self.callback: Callable[[int, Any, dict], None] | None = None
         self.checkpoint: Checkpoint | None = None
@@ -257,7 +273,7 @@ class AnisoPhotonMapper:
         total, and without a limit to their number that of each."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[int(sensor)]
-        self.statistics, self.variance, self._last_map = {}, None, None
+        self.statistics, self.variance, self._last_map, self.layers = {}, None, None, {}
         with dr.suspend_grad():
             prepared = prepare(scene, self.settings, self.hide_emitters)
             controls = progressive.Controls(
@@ -267,6 +283,7 @@ class AnisoPhotonMapper:
                 prepared, sensor, _as_int(seed), spp, controls, self.statistics
             )
             self.variance = done.variance
+            self.layers = self._layers(done)
             if done.map:
                 self._last_map = (scene, done.scene, done.map, done.radius)
             image = sensor.film().develop() if develop else mi.TensorXf()
@@ -310,6 +327,13 @@ class AnisoPhotonMapper:
         raise NotImplementedError(_NO_DERIVATIVES)
 
     # --- Ours ---
+
+    def _layers(self, done) -> dict[str, np.ndarray]:
+        names = self.settings.layer_names
+        found = {} if done.layers is None else develop(names, done.layers)
+        if "standard_error" in names and done.variance is not None:
+            found["standard_error"] = np.sqrt(done.variance[..., :3]).astype(np.float32)
+        return found
 
     def stop_after(self, passes: int = 0, time: float = 0.0, target_error: float = 0.0) -> None:
         """Replace the stopping rules by these, whichever comes first; 0 is no limit. Raises

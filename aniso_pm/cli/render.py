@@ -11,20 +11,25 @@ from typing import Annotated, Any
 
 import typer
 from aniso_pm import output
+from aniso_pm.denoising import AUXILIARY
 from aniso_pm.errors import InputError, is_interrupt, one_line
 from aniso_pm.progress import bar
 
 from .common import (
     INTERRUPTED,
     Define,
+    Integrator,
     InterruptError,
+    Parameter,
     SceneFile,
     Variant,
     load,
     mitsuba_log,
     parse_defines,
+    parse_parameters,
     set_variant,
 )
+from .pictures import Bits, Denoise, Exposure, Pictures, Png, Tonemap
 
 
 def render(
@@ -59,13 +64,22 @@ def render(
         float, typer.Option(min=0, help="Seconds between savings of picture and state.")
     ] = 30.0,
     sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
-    png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
+    integrator_name: Integrator = None,
+    parameter: Parameter = None,
+    layers: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="Layers to write as well: direct,albedo,…")
+    ] = None,
+    denoise: Denoise = False,
+    png: Png = False,
+    exposure: Exposure = 0.0,
+    tonemap: Tonemap = "srgb",
+    bits: Bits = 8,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no warnings.")] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
     ] = False,
 ) -> int:
-    """Render a scene with the integrator it names and write the picture as OpenEXR.
+    """Render a scene with the integrator it names, or another one, and write it as OpenEXR.
 
     The header of the picture records parameters, seed, versions, timings and statistics. With
     several passes the layers "variance" and "standard_error" tell how noisy the picture is.
@@ -75,14 +89,14 @@ def render(
     saved again and again; --resume goes on from there. Finished pictures lose their state unless
     --resume or --keep-state was given. Passes 8 to 15 of a picture, to be merged with passes 0 to
     7, are --first-pass 8 --passes 8 with the same samples per pass.
+
+    --layers takes albedo, normal, depth, position, direct, caustic, indirect, samples, radius,
+    standard_error (see the integrator's parameter of that name). --denoise leaves the picture as it
+    was rendered and adds a layer; it takes the layers albedo and normal as well.
     """
     # --- Find out what would fail, before anything slow ---
-    defines = parse_defines(define or [])
-    if out.suffix.lower() != ".exr":
-        raise InputError(f"cannot write '{out}': the output's name must end in .exr")
-    picture = out.with_suffix(".png") if png else None
-    for path in filter(None, [out, picture]):
-        output.check_writable(path)
+    defines, parameters = parse_defines(define or []), parse_parameters(parameter)
+    pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
     if not scene.is_file():
         raise InputError(f"{scene}: there is no such file")
 
@@ -90,11 +104,12 @@ def render(
     with mitsuba_log(quiet):
         # --- Load the scene ---
         started = time.perf_counter()
-        world, camera, integrator = load(scene, defines, sensor)
+        world, camera, integrator = load(scene, defines, sensor, integrator_name, parameters)
         loaded = time.perf_counter()
         rules = {"passes": passes, "time": seconds, "target_error": target_error}
         rules = {name: value for name, value in rules.items() if value is not None}
         kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state)
+        _ask_for_layers(integrator, layers, denoise)
         made_by = {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
 
         def write() -> dict[str, Any]:
@@ -103,9 +118,7 @@ def render(
             now = time.perf_counter()
             record["seconds"] = {"load": loaded - started, "render": now - loaded}
             variance = getattr(integrator, "variance", None)
-            output.write_exr(camera.film(), out, record, variance)
-            if picture:
-                output.write_png(camera.film(), picture)
+            pictures.write(camera.film(), record, variance, getattr(integrator, "layers", None))
             return record
 
         # --- Render ---
@@ -125,10 +138,10 @@ def render(
             state_file.unlink(missing_ok=True)
 
     if as_json:
-        record |= {"output": str(out), "png": str(picture) if picture else None}
+        record |= {"output": str(out), "png": str(pictures.png) if pictures.png else None}
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
     elif not quiet:
-        print(_done(record, out, picture))
+        print(_done(record, out, pictures.png))
     if statistics.get("interrupted"):
         print("aniso-pm: interrupted, the picture so far is written", file=sys.stderr)
         return INTERRUPTED
@@ -138,7 +151,11 @@ def render(
 def merge(
     states: Annotated[list[Path], typer.Argument(help="States (.state), or their pictures.")],
     out: Annotated[Path, typer.Option("--output", "-o", help="Picture to write (.exr).")],
-    png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
+    denoise: Denoise = False,
+    png: Png = False,
+    exposure: Exposure = 0.0,
+    tonemap: Tonemap = "srgb",
+    bits: Bits = 8,
     as_json: Annotated[
         bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
     ] = False,
@@ -153,11 +170,7 @@ def merge(
     from aniso_pm.state import State, StateError
     from aniso_pm.state import merge as merged
 
-    if out.suffix.lower() != ".exr":
-        raise InputError(f"cannot write '{out}': the output's name must end in .exr")
-    picture = out.with_suffix(".png") if png else None
-    for path in filter(None, [out, picture]):
-        output.check_writable(path)
+    pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
     try:
         loaded = {}
         for name in states:
@@ -185,12 +198,10 @@ def merge(
         "statistics": total.statistics,
         "depends_on": total.identity,
     }
-    output.write_exr(film, out, record, total.variance())
-    if picture:
-        output.write_png(film, picture)
+    pictures.write(film, record, total.variance(), total.layers())
     total.save(out.with_suffix(".state"))
     if as_json:
-        record |= {"output": str(out), "png": str(picture) if picture else None}
+        record |= {"output": str(out), "png": str(pictures.png) if pictures.png else None}
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
     return 0
 
@@ -218,6 +229,21 @@ def _prepare_passes(
             raise InputError(one_line(error)) from error
     integrator.first_pass = first_pass
     return keep_state if keep_state or integrator.settings.passes != 1 else None
+
+
+def _ask_for_layers(integrator, layers: str | None, denoise: bool) -> None:
+    """Set the layers to be kept; an InputError where the integrator has none."""
+    if not hasattr(integrator, "settings"):
+        if layers:
+            raise InputError(f"--layers: {integrator.class_name()} has none; aniso_pm does")
+        return
+    asked = integrator.settings.layers if layers is None else layers
+    if denoise:
+        asked += "," + ",".join(AUXILIARY)
+    try:
+        integrator.settings = integrator.settings.with_(layers=asked.strip(","))
+    except ValueError as error:
+        raise InputError(one_line(error)) from error
 
 
 def _render(world, camera, integrator, seed: int, spp: int | None, quiet: bool) -> None:
