@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -105,15 +106,16 @@ def to_rgb(spectrum, wavelengths):
     return mi.Color3f(spectrum.x) if mi.is_monochromatic else spectrum
 
 
-def splat_channels(film, position, channels, spp, weight=None) -> np.ndarray:
+def splat_channels(film, position, channels, spp, weight=None, box=False) -> np.ndarray:
     """As :func:`splat` for values of any meaning, weight last: float64, height × width ×
-    channels."""
+    channels. box: weighted by a box filter, not by the film's."""
     like = film.create_block()
+    rfilter = mi.load_dict({"type": "box"}) if box else film.rfilter()
     block = mi.ImageBlock(
         like.size(),
         like.offset(),
         len(channels) + 1,
-        film.rfilter(),
+        rfilter,
         False,
         coalesce=like.coalesce() and spp >= 4,
     )
@@ -147,6 +149,7 @@ def describe(film) -> dict[str, Any]:
         "crop_size": [int(n) for n in film.crop_size()],
         "crop_offset": [int(n) for n in film.crop_offset()],
         "formats": formats,
+        "filter": pixel_weights(film),
     }
 
 
@@ -185,6 +188,18 @@ def noise_share(film) -> float:
     x = (dr.arange(mi.Float, _STEPS) + 0.5) * (radius / _STEPS)
     f = np.broadcast_to(rfilter.eval(x).numpy().astype(np.float64), _STEPS)
     return float(((f**2).mean() / f.mean() ** 2 / (2 * radius)) ** 2)
+
+
+def pixel_weights(film) -> list[float]:
+    """Means of the reconstruction filter over whole pixels along a line, normalised, the middle
+    one in the middle: [1] for a box."""
+    rfilter = film.rfilter()
+    reach = math.ceil(rfilter.radius() - 0.5 - 1e-4)
+    steps = 2 * reach + 1
+    x = (dr.arange(mi.Float, steps * _STEPS) + 0.5) / _STEPS - 0.5 * steps
+    f = np.broadcast_to(rfilter.eval(x).numpy(), steps * _STEPS)
+    mean = f.reshape(steps, _STEPS).mean(1, dtype=np.float64)
+    return (mean / mean.sum()).tolist()
 
 
 def border(film) -> int:

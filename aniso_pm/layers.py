@@ -40,8 +40,14 @@ CHANNELS = {
     "samples": "Y",
     "radius": "Y",
     "standard_error": "RGB",
+    "denoising_picture": "RGB",
+    "denoising_albedo": "RGB",
+    "denoising_normal": "XYZ",
+    "denoising_error": "RGB",
+    "denoised": "RGB",
 }
-NAMES = tuple(CHANNELS)
+# What can be asked for.
+NAMES = (*LIGHT, *SURFACE, "samples", "radius", "standard_error", "denoising")
 
 
 def parse(text: str) -> tuple[str, ...]:

@@ -99,7 +99,7 @@ def write_exr(
     import mitsuba as mi
 
     bitmap = film.bitmap()
-    more = dict(layers or {})
+    more = {name: layer for name, layer in (layers or {}).items() if layer.ndim == 3}
     if variance is not None:
         more |= {"variance": variance, "standard_error": variance**0.5}
     if more:

@@ -183,7 +183,8 @@ class Prepared:
     @property
     def surface_layers(self) -> bool:
         """Does anybody ask for what eye paths see?"""
-        return any(name in layers.SURFACE for name in self.settings.layer_names)
+        wanted = (*layers.SURFACE, "denoising")
+        return any(name in wanted for name in self.settings.layer_names)
 
     def photon_map(
         self,

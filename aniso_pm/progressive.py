@@ -26,7 +26,7 @@ from .arrays import own
 from .clock import Clock
 from .errors import is_interrupt
 from .eye import Thinning
-from .layered import Layered
+from .layered import Layered, plus, whole_pass
 from .pilot import photons_per_path, settle
 from .prepared import EYE, PROBE, THINNING, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
@@ -62,25 +62,30 @@ class Controls:
     callback    called as callback(pass_index, image, statistics) after every pass: the picture so
                 far as a tensor, and the statistics so far.
     checkpoint  where to keep the state.
+    so_far      called as so_far(variance, layers, passes), as in ``Rendered``, before somebody else
+                looks at the picture so far.
     """
 
     first_pass: int = 0
     progress: Callable[[float, int | None, str], None] | None = None
     callback: Callable[[int, Any, dict], None] | None = None
     checkpoint: state.Checkpoint | None = None
+    so_far: Callable[[Any, Any, int], None] | None = None
 
 
 @dataclass
 class Rendered:
     """What is left of a rendering beside the film: the scene with what was chosen for it, map and
     radius of the last pass (None if no pass was rendered), variance of the picture (None with one
-    pass), sums of the layers that were asked for (see ``layered``; None: none were)."""
+    pass), sums of the layers that were asked for (see ``layered``; None: none were) over so many
+    passes."""
 
     scene: Prepared
     map: Any
     radius: float | None
     variance: np.ndarray | None
-    layers: np.ndarray | None
+    layers: dict[str, np.ndarray] | None
+    passes: int
 
 
 def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, statistics: dict):
@@ -107,7 +112,7 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
     run.finish()
     advice.after(scene, statistics)
     decided = replace(run.scene.thawed(), footprint=None)
-    return Rendered(decided, run.map, run.radius, run.variance, run.done.layers)
+    return Rendered(decided, run.map, run.radius, run.variance, run.done.layers, run.passes)
 
 
 class _Done(NamedTuple):
@@ -116,7 +121,7 @@ class _Done(NamedTuple):
     sums: Sums | None
     passes: list[list[int]]
     counts: dict[str, int]
-    layers: np.ndarray | None = None
+    layers: dict[str, np.ndarray] | None = None
 
 
 class _Room:
@@ -148,7 +153,7 @@ class _Run:
         self.done = _Done(None, [], dict.fromkeys((*_COUNTS, "passes"), 0))
         self.photons, self.points = _Room(), _Room()
         self.layered = Layered.of(self.film, scene.settings.layer_names)
-        self.layers: np.ndarray | None = None  # of the pass that is being rendered
+        self.layers: dict[str, np.ndarray] | None = None  # of the pass that is being rendered
         self.unfinished = None  # (image, counts, layers) of the pass that is being rendered
 
     # --- Before the first pass ---
@@ -247,8 +252,8 @@ class _Run:
                 f"but passes {wanted} are asked for"
             )
         counts = {name: earlier.statistics[name] for name in self.done.counts}
-        sums, layers = Sums.from_arrays(earlier.arrays), earlier.arrays.get("layers")
-        self.done = _Done(sums, earlier.passes, counts, layers)
+        sums = Sums.from_arrays(earlier.arrays)
+        self.done = _Done(sums, earlier.passes, counts, earlier.layer_sums() or None)
         self.stopping.spent_before = earlier.seconds
         self.statistics |= counts
         self.clock.go_on_from(earlier.statistics["seconds"])
@@ -287,9 +292,7 @@ class _Run:
                 sums = Sums.zeros(image.shape, self._keeps_variance())
             total = {name: n + counts.get(name, 1) for name, n in self.done.counts.items()}
             passes = state.extended(self.done.passes, index)
-            layers = self.layers
-            if layers is not None and self.done.layers is not None:
-                layers = self.done.layers + layers
+            layers = self.layers and plus(self.done.layers, whole_pass(self.layers))
             self.done = _Done(sums.plus(image), passes, total, layers)
             self.unfinished = None
             self.statistics |= {**total, "radius": self.radius}
@@ -367,9 +370,9 @@ class _Run:
             dr.eval(image)
             if self.layered is not None:
                 found = self.layered.wavefront(
-                    position, seen.seen, seen.gathered, ray, ray_weight, lanes, finite, each
+                    position, L, seen.seen, seen.gathered, ray, ray_weight, lanes, finite, each
                 )
-                self.layers = found if self.layers is None else self.layers + found
+                self.layers = plus(self.layers, found)
             self.clock.lap("film")
             counts["eye_samples"] += lanes.count
             counts["spp"] = int(spp * done)
@@ -394,6 +397,11 @@ class _Run:
         if asked and self.stopping.is_checkpoint(self.done.counts["passes"]):
             self._estimate_error()
 
+    @property
+    def passes(self) -> int:
+        """Whole ones that are done."""
+        return self.done.counts["passes"]
+
     def _estimate_error(self):
         sums, count = self.done.sums, self.done.counts["passes"]
         if count > 1 and sums.square is not None:
@@ -416,10 +424,13 @@ class _Run:
         due = checkpoint is not None and checkpoint.due()
         if due or callback:
             films.show(self.film, self.done.sums.film_tensor())
+            if due:
+                self._estimate_error()
+            if self.controls.so_far:
+                self.controls.so_far(self.variance, self.done.layers, self.passes)
         if callback:
             callback(index, self.film.develop(), dict(self.statistics))
         if due:
-            self._estimate_error()
             checkpoint.write(self._state())
             if checkpoint.on_write:
                 checkpoint.on_write()
@@ -433,8 +444,7 @@ class _Run:
             self.done.passes,
             self.stopping.spent(),
             self.statistics,
-            self.done.sums.arrays()
-            | ({} if self.done.layers is None else {"layers": self.done.layers}),
+            self.done.sums.arrays() | (self.done.layers or {}),
         )
 
     # --- At the end ---

@@ -28,7 +28,7 @@ from .layers import parse
 
 VERSION = 1
 _ARRAYS = ("first", "square", "cross")
-_OPTIONAL = ("layers",)
+_OPTIONAL = ("layers", "denoising")
 
 
 class StateError(ValueError):
@@ -44,7 +44,7 @@ class State:
     passes      half-open ranges of pass numbers, ascending, disjoint and not touching.
     seconds     rendering time spent on them.
     statistics  of the renderer, over these passes.
-    arrays      ``Sums.arrays()``, and the sums of layers as "layers" where they were asked for.
+    arrays      ``Sums.arrays()``, and the sums of layers that were asked for (``layered``).
     """
 
     identity: dict[str, Any]
@@ -63,11 +63,17 @@ class State:
         """Variance of the picture, height × width × channels; None with one pass."""
         return mean_and_variance(self.arrays, self.count)[1] if self.count > 1 else None
 
+    def layer_sums(self) -> dict[str, np.ndarray]:
+        """The sums of layers; see ``layered``."""
+        return {name: self.arrays[name] for name in _OPTIONAL if name in self.arrays}
+
     def layers(self) -> dict[str, np.ndarray]:
         """The layers that were asked for; see ``layered.develop``."""
-        if "layers" not in self.arrays:
+        sums = self.layer_sums()
+        if not sums:
             return {}
-        return develop(parse(self.identity['parameter "layers"']), self.arrays["layers"])
+        names = parse(self.identity['parameter "layers"'])
+        return develop(names, sums, self.count, self.film["filter"])
 
     def save(self, path: Path) -> None:
         """Write atomically, down to the disk. Raises ``output.OutputError``."""

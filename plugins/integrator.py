@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, fields
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm import progressive
+from aniso_pm.film import pixel_weights as film_weights
 from aniso_pm.layered import develop
 from aniso_pm.pilot import USUAL, automatic_radius
 from aniso_pm.prepared import Unsupported, prepare
@@ -166,7 +168,10 @@ class AnisoPhotonMapper:
          (world space) at that receiver, through mirrors, glass and glossy metal; ``depth``
          (distance from the camera) and ``position`` of the first surface. What was done:
          ``samples`` of each pixel, mean ``radius`` of its kernels (world units), and
-         ``standard_error`` (two passes or more). They are in the attribute ``layers``, and in the
+         ``standard_error`` (two passes or more). ``denoising`` is what a denoiser needs: picture,
+         albedo and normal as a box filter gives them, and the picture's standard error, as the
+         layers ``denoising_picture``, ``denoising_albedo``, ``denoising_normal`` and
+         ``denoising_error``. They are in the attribute ``layers``, and in the
          EXR that :monosp:`aniso-pm render` writes. (Default: none)
 
      * - hide_emitters
@@ -195,7 +200,8 @@ class AnisoPhotonMapper:
 
     Before ``render()`` these attributes may be set: ``progress``, a function (done, total, text)
     that is called after each wavefront (see ``aniso_pm.progress.bar``); ``callback``, a function
-    (pass_index, image, statistics) that is called after each pass with the picture so far;
+    (pass_index, image, statistics) that is called after each pass with the picture so far, when
+    ``variance`` and ``layers`` hold those so far;
     ``checkpoint``, an ``aniso_pm.state.Checkpoint`` that keeps the state of the rendering in a file
     from which it can be resumed; ``first_pass``, the number of the first pass. Pass i is the same
     whatever passes are rendered before or after it, or none.
@@ -276,14 +282,14 @@ class AnisoPhotonMapper:
         self.statistics, self.variance, self._last_map, self.layers = {}, None, None, {}
         with dr.suspend_grad():
             prepared = prepare(scene, self.settings, self.hide_emitters)
+            so_far = partial(self._so_far, film_weights(sensor.film()))
             controls = progressive.Controls(
-                self.first_pass, self.progress, self.callback, self.checkpoint
+                self.first_pass, self.progress, self.callback, self.checkpoint, so_far
             )
             done = progressive.render(
                 prepared, sensor, _as_int(seed), spp, controls, self.statistics
             )
-            self.variance = done.variance
-            self.layers = self._layers(done)
+            so_far(done.variance, done.layers, done.passes)
             if done.map:
                 self._last_map = (scene, done.scene, done.map, done.radius)
             image = sensor.film().develop() if develop else mi.TensorXf()
@@ -328,12 +334,12 @@ class AnisoPhotonMapper:
 
     # --- Ours ---
 
-    def _layers(self, done) -> dict[str, np.ndarray]:
+    def _so_far(self, weights, variance, sums, passes):
         names = self.settings.layer_names
-        found = {} if done.layers is None else develop(names, done.layers)
-        if "standard_error" in names and done.variance is not None:
-            found["standard_error"] = np.sqrt(done.variance[..., :3]).astype(np.float32)
-        return found
+        self.variance = variance
+        self.layers = {} if sums is None else develop(names, sums, passes, weights)
+        if "standard_error" in names and variance is not None:
+            self.layers["standard_error"] = np.sqrt(variance[..., :3]).astype(np.float32)
 
     def stop_after(self, passes: int = 0, time: float = 0.0, target_error: float = 0.0) -> None:
         """Replace the stopping rules by these, whichever comes first; 0 is no limit. Raises

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,6 +26,12 @@ Denoise = Annotated[
         "--denoise", help="Also write the layer denoised.*, which is then what the PNG shows."
     ),
 ]
+
+
+_TEXTURE = (
+    "aniso-pm: warning: denoising takes noise for texture where the reconstruction filter is wider "
+    'than a pixel; render with aniso_pm and --layers denoising, or with <rfilter type="box"/>'
+)
 
 
 @dataclass(frozen=True)
@@ -63,9 +70,17 @@ class Pictures:
         return Pictures(out, picture, exposure, tonemap, bits, denoise)
 
     def write(
-        self, film, record: dict[str, Any], variance=None, layers: Mapping[str, Any] | None = None
+        self,
+        film,
+        record: dict[str, Any],
+        variance=None,
+        layers: Mapping[str, Any] | None = None,
+        weights: Sequence[float] = (1.0,),
     ) -> None:
-        """Write the film; what was done to denoise it goes into ``record``."""
+        """Write the film; what was done to denoise it goes into ``record``.
+
+        weights  of the filter that the picture was made with (``film.pixel_weights``).
+        """
         from aniso_pm import denoising, display
 
         layers = dict(layers or {})
@@ -82,6 +97,8 @@ class Pictures:
                 known["standard_error"] = variance[..., :3] ** 0.5
             layers["denoised"] = denoising.denoise(colours, known)
             record["denoise"] = denoising.about(known)
+            if len(weights) > 1 and not record["denoise"]["without_pixel_filter"]:
+                print(_TEXTURE, file=sys.stderr)
             colours[..., :3] = layers["denoised"]
         output.write_exr(film, self.out, record, variance, layers)
         if self.png:

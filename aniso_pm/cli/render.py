@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import typer
 from aniso_pm import output
-from aniso_pm.denoising import AUXILIARY
 from aniso_pm.errors import InputError, is_interrupt, one_line
 from aniso_pm.progress import bar
 
@@ -66,8 +65,9 @@ def render(
     sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
     integrator_name: Integrator = None,
     parameter: Parameter = None,
-    layers: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="Layers to write as well: direct,albedo,…")
+    layer_names: Annotated[
+        str | None,
+        typer.Option("--layers", metavar="NAMES", help="Layers to write as well: direct,albedo,…"),
     ] = None,
     denoise: Denoise = False,
     png: Png = False,
@@ -91,8 +91,8 @@ def render(
     7, are --first-pass 8 --passes 8 with the same samples per pass.
 
     --layers takes albedo, normal, depth, position, direct, caustic, indirect, samples, radius,
-    standard_error (see the integrator's parameter of that name). --denoise leaves the picture as it
-    was rendered and adds a layer; it takes the layers albedo and normal as well.
+    standard_error, denoising (see the integrator's parameter of that name). --denoise leaves the
+    picture as it was rendered and adds a layer, denoised; it asks for the layers of denoising.
     """
     # --- Find out what would fail, before anything slow ---
     defines, parameters = parse_defines(define or []), parse_parameters(parameter)
@@ -109,7 +109,9 @@ def render(
         rules = {"passes": passes, "time": seconds, "target_error": target_error}
         rules = {name: value for name, value in rules.items() if value is not None}
         kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state)
-        _ask_for_layers(integrator, layers, denoise)
+        _ask_for_layers(integrator, layer_names, denoise)
+        from aniso_pm.film import pixel_weights
+
         made_by = {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
 
         def write() -> dict[str, Any]:
@@ -118,7 +120,8 @@ def render(
             now = time.perf_counter()
             record["seconds"] = {"load": loaded - started, "render": now - loaded}
             variance = getattr(integrator, "variance", None)
-            pictures.write(camera.film(), record, variance, getattr(integrator, "layers", None))
+            layers = getattr(integrator, "layers", None)
+            pictures.write(camera.film(), record, variance, layers, pixel_weights(camera.film()))
             return record
 
         # --- Render ---
@@ -198,7 +201,8 @@ def merge(
         "statistics": total.statistics,
         "depends_on": total.identity,
     }
-    pictures.write(film, record, total.variance(), total.layers())
+    weights = total.film.get("filter", [1.0])
+    pictures.write(film, record, total.variance(), total.layers(), weights)
     total.save(out.with_suffix(".state"))
     if as_json:
         record |= {"output": str(out), "png": str(pictures.png) if pictures.png else None}
@@ -239,7 +243,7 @@ def _ask_for_layers(integrator, layers: str | None, denoise: bool) -> None:
         return
     asked = integrator.settings.layers if layers is None else layers
     if denoise:
-        asked += "," + ",".join(AUXILIARY)
+        asked += ",denoising"
     try:
         integrator.settings = integrator.settings.with_(layers=asked.strip(","))
     except ValueError as error:
