@@ -65,7 +65,7 @@ def denoise(
     found = np.array(oidn.denoise(colour, hdr=True, **images))
     if blend and error is not None:
         found = _blended(colour, found, error)
-    return _filtered(found, known.get("filter", [1.0]))
+    return filtered_by(found, known.get("filter", [1.0]))
 
 
 def about(layers: Mapping[str, Any], blend: bool = True) -> dict[str, Any]:
@@ -121,8 +121,9 @@ def _mean_around(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _filtered(image: np.ndarray, weights) -> np.ndarray:
-    """``image`` with a separable filter over whole pixels."""
+def filtered_by(image: np.ndarray, weights) -> np.ndarray:
+    """``image`` (height × width × channels) with a separable filter, given by its weights over
+    whole pixels (``film.pixel_weights``)."""
     reach = len(weights) // 2
     for axis in (0, 1):
         width = [(0, 0)] * 3

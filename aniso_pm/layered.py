@@ -25,6 +25,8 @@ from .accumulate import mean_and_variance
 from .layers import CHANNELS, LIGHT, SURFACE
 
 _SEEN = 9  # channels of colour, albedo, normal
+# Passes from which on their spread tells pixel by pixel how far to trust the picture.
+_PASSES = 8
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ def develop(
     passes   whole ones.
     weights  of the film's filter over whole pixels (``film.pixel_weights``).
 
-    ``denoising`` is four layers, ``denoising_picture``, ``_albedo``, ``_normal`` and, after two
+    ``denoising`` is four layers, ``denoising_picture``, ``_albedo``, ``_normal`` and, after eight
     passes, ``_error``, and the array ``denoising_filter``, the weights.
     """
     layers: dict[str, np.ndarray] = {}
@@ -139,7 +141,7 @@ def develop(
         seen = _ratio(array[..., :_SEEN], array[..., _SEEN : _SEEN + 1])
         for k, name in enumerate(("picture", "albedo", "normal")):
             layers[f"denoising_{name}"] = seen[..., 3 * k : 3 * k + 3]
-        if passes > 1:
+        if passes >= _PASSES:
             W, W2 = array[..., _SEEN : _SEEN + 1], array[..., -1:]
             of_weight = array[..., _SEEN + 1 : _SEEN + 4], array[..., _SEEN + 4 : _SEEN + 7]
             as_sums = {

@@ -417,7 +417,9 @@ class _Run:
         if self.scene.settings.passes:
             number += f"/{self.controls.first_pass + self.scene.settings.passes}"
         text = number + (f", error {error:.2%}" if error else "")
-        self.controls.progress(count + part if part < 1 else count, total, text)
+        with self.stopping.not_counted():
+            self.controls.progress(count + part if part < 1 else count, total, text)
+        self.clock.lap("output")
 
     def _after_pass(self, index: int):
         checkpoint, callback = self.controls.checkpoint, self.controls.callback
@@ -429,7 +431,8 @@ class _Run:
             if self.controls.so_far:
                 self.controls.so_far(self.variance, self.done.layers, self.passes)
         if callback:
-            callback(index, self.film.develop(), dict(self.statistics))
+            with self.stopping.not_counted():
+                callback(index, self.film.develop(), dict(self.statistics))
         if due:
             checkpoint.write(self._state())
             if checkpoint.on_write:

@@ -169,10 +169,10 @@ class AnisoPhotonMapper:
          (distance from the camera) and ``position`` of the first surface. What was done:
          ``samples`` of each pixel, mean ``radius`` of its kernels (world units), and
          ``standard_error`` (two passes or more). ``denoising`` is what a denoiser needs: picture,
-         albedo and normal as a box filter gives them, and the picture's standard error, as the
-         layers ``denoising_picture``, ``denoising_albedo``, ``denoising_normal`` and
-         ``denoising_error``. They are in the attribute ``layers``, and in the
-         EXR that :monosp:`aniso-pm render` writes. (Default: none)
+         albedo and normal as a box filter gives them and, from eight passes on, the picture's
+         standard error, as the layers ``denoising_picture``, ``denoising_albedo``,
+         ``denoising_normal`` and ``denoising_error``. All are in the attribute ``layers``, and in
+         the EXR that :monosp:`aniso-pm render` writes. (Default: none)
 
      * - hide_emitters
        - |bool|

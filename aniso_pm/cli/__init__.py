@@ -16,7 +16,7 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import InputError, is_interrupt, one_line
 
-from . import bench, examine, explain, reference, render, report, scenes
+from . import bench, examine, explain, reference, render, report, scenes, view
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -77,6 +77,7 @@ def _program(
 for command in (
     render.render,
     render.merge,
+    view.view,
     reference.reference,
     report.report,
     scenes.scenes,

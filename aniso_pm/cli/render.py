@@ -116,7 +116,7 @@ def render(
 
         def write() -> dict[str, Any]:
             """Write the picture so far and what made it."""
-            record = _record(integrator, camera) | made_by
+            record = record_of(integrator, camera) | made_by
             now = time.perf_counter()
             record["seconds"] = {"load": loaded - started, "render": now - loaded}
             variance = getattr(integrator, "variance", None)
@@ -280,7 +280,8 @@ def _done(record: dict[str, Any], out: Path, picture: Path | None) -> str:
     return f"{', '.join(str(path) for path in (out, picture) if path)}: {', '.join(parts)}"
 
 
-def _record(integrator, camera) -> dict[str, Any]:
+def record_of(integrator, camera) -> dict[str, Any]:
+    """What made a picture, for its header."""
     from aniso_pm.doctor import versions
 
     statistics = dict(getattr(integrator, "statistics", None) or {})
