@@ -1,6 +1,7 @@
 """The live view: a rendering that is steered from outside, and the page that steers it."""
 
 import builtins
+import io
 import re
 import shutil
 import subprocess
@@ -20,6 +21,7 @@ from aniso_pm.view import server
 from aniso_pm.view.session import Session
 from aniso_pm.view.snapshot import Snapshot
 from aniso_pm.view.watched import Watched
+from PIL import Image
 from rooms import room
 from test_cli import OURS, PATH, SCENE, assert_one_line, run  # noqa: F401 (fixture)
 
@@ -189,7 +191,7 @@ def test_pictures_are_those_of_the_layer_and_the_exposure(client):
     def shown(**query):
         answer = client.get("/picture.png", query_string={"token": TOKEN} | query)
         assert answer.mimetype == "image/png"
-        return np.array(mi.Bitmap(mi.MemoryStream(answer.data))).astype(float)
+        return np.array(Image.open(io.BytesIO(answer.data))).astype(float)
 
     plain = shown()
     assert plain.shape == (4, 6, 3) and plain.max() == 255
