@@ -2,6 +2,7 @@
 
 import builtins
 import json
+from pathlib import Path
 
 import aniso_pm
 import mitsuba as mi
@@ -267,3 +268,19 @@ def test_a_warning_is_printed_once(run, tmp_path, monkeypatch):  # noqa: F811
         "aniso-pm: warning: another one",
         "aniso-pm: 2 warnings came again and are not repeated",
     ]
+
+
+@pytest.mark.slow
+def test_what_blender_exports_renders_untouched(run, tmp_path):  # noqa: F811
+    """The light of `path` by another integrator, with the file as it is but for its assets."""
+    tests = Path(__file__).resolve().parent
+    given = [tests / "blender_export.xml", "-D", f"assets={tests.parent / 'scenes'}", "--quiet"]
+    ours = ["--integrator", "aniso_pm", "-p", "passes=4", "-p", "max_depth=12"]
+    for name, more in (("path", ["--spp", "1024"]), ("ours", [*ours, "--spp", "256"])):
+        status, _, stderr = run("render", *given, "-o", f"{name}.exr", *more)
+        assert (status, stderr) == (0, "")
+    images = [np.array(mi.Bitmap(f"{name}.exr").split()[0][1]) for name in ("path", "ours")]
+    path, found = (image[..., :3].astype(float) for image in images)
+    assert found.mean() == pytest.approx(path.mean(), rel=0.02)
+    # Pixel by pixel as far as noise allows: the camera looks where Blender's did.
+    assert np.abs(found - path).mean() < 0.1 * path.mean()

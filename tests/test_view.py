@@ -254,6 +254,7 @@ CHROMIUM = next(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium to drive the page with")
 def test_the_page_in_a_browser(tmp_path):
     """Start, layers, exposure, pause, a pixel, other parameters, a phone, stop and save."""
