@@ -5,12 +5,14 @@ import json
 from pathlib import Path
 
 import aniso_pm
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
-from aniso_pm import display
+from aniso_pm import denoising, display
 from aniso_pm.errors import InputError
+from aniso_pm.film import pixel_weights, splat
 from PIL import Image
 from rooms import room
 from test_cli import OURS, PATH, SCENE, assert_one_line, run  # noqa: F401 (fixture)
@@ -103,6 +105,28 @@ def test_noise_is_removed_whatever_the_reconstruction_filter(variant_llvm_rgb):
     denoised = aniso_pm.denoise(rendered, found)
     assert mse(denoised, right) < 0.3 * mse(rendered, right)
     assert denoised.mean() == pytest.approx(right.mean(), rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["box", "tent", "gaussian", "mitchell", "lanczos"])
+def test_a_filter_over_whole_pixels_is_the_films(variant_llvm_rgb, name):
+    """An edge between pixels, filtered by the film and afterwards."""
+    film = mi.load_dict({"type": "hdrfilm", "width": 20, "height": 6, "rfilter": {"type": name}})
+    film.prepare([])
+    weights = pixel_weights(film)
+    assert sum(weights) == pytest.approx(1) and weights == pytest.approx(weights[::-1], abs=1e-6)
+    assert (len(weights) == 1) == (name == "box")
+    size, each = film.size(), 1024
+    pixel = dr.arange(mi.UInt32, size[0] * size[1] * each) // each
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, dr.width(pixel))
+    column, row = pixel % size[0], pixel // size[0]
+    position = mi.Point2f(mi.Float(column), mi.Float(row)) + sampler.next_2d()
+    bright = dr.select(column >= 10, mi.Float(1), mi.Float(0))
+    film.put_block(mi.ImageBlock(splat(film, position, mi.Color3f(bright), True, each, None)))
+    edge = np.zeros((6, 20, 3), np.float32)
+    edge[:, 10:] = 1
+    found = denoising.filtered_by(edge, weights)
+    np.testing.assert_allclose(np.array(film.develop())[..., :3], found, atol=0.02)
 
 
 def test_layers_of_another_size_are_told():
