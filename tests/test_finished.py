@@ -196,7 +196,7 @@ def channels(path):
 def test_layers_and_denoised_picture_are_written_and_merged(run, tmp_path):  # noqa: F811
     """As Nuke, Blender and tev name them; the rendered picture stays as it is."""
     scene = scene_file(tmp_path)
-    common = ["render", scene, "--passes", "2", "--spp", "8"]
+    common = ["render", scene, "--passes", "8", "--spp", "8"]
     plain = run(*common, "-o", "plain.exr", "--keep-state")
     assert plain[0] == 0, plain
     asked = ["--layers", "direct,caustic,indirect,depth,position,samples,radius"]

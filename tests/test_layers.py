@@ -89,7 +89,9 @@ def test_light_adds_up_and_is_the_same_for_every_use_of_the_map(
         assert (off < [0.02, 0.1, 0.04]).all(), (use, off)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+@pytest.mark.parametrize(
+    "variant", [pytest.param("llvm_ad_mono", marks=pytest.mark.slow), "llvm_ad_spectral"]
+)
 @pytest.mark.parametrize(
     "use", ["global", *(pytest.param(use, marks=pytest.mark.slow) for use in list(USES)[2:])]
 )
