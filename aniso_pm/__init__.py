@@ -23,7 +23,8 @@ _llvm.prepare()
 
 # Dr.Jit must load after LLVM.
 from aniso_pm import asg, kernel, ndf, plugins, progress, state, warp  # noqa: E402
+from aniso_pm.denoising import denoise  # noqa: E402
 
 plugins.register()
 
-__all__ = ["__version__", "asg", "kernel", "ndf", "progress", "state", "warp"]
+__all__ = ["__version__", "asg", "denoise", "kernel", "ndf", "progress", "state", "warp"]

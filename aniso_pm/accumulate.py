@@ -23,6 +23,9 @@ import numpy as np
 
 from .arrays import own
 
+# Arrays of sums: Σ A, Σ A², Σ A W.
+NAMES = ("first", "square", "cross")
+
 
 @dataclass(frozen=True)
 class Sums:
@@ -80,10 +83,12 @@ class Sums:
 
     @staticmethod
     def from_arrays(arrays: dict[str, np.ndarray]) -> Sums:
-        """Inverse of :meth:`arrays`."""
+        """Inverse of :meth:`arrays`; other arrays are left alone."""
         height, width, channels = map(int, arrays["first"].shape)
         shape = height, width, channels
-        flat = {name: own(mi.Float64, array.astype(float)) for name, array in arrays.items()}
+        flat = {
+            name: own(mi.Float64, arrays[name].astype(float)) for name in NAMES if name in arrays
+        }
         return Sums(shape, flat["first"], flat.get("square"), flat.get("cross"))
 
 

@@ -79,6 +79,8 @@ class Gathered:
     capped      it does, and met the aspect cap.
     degenerate  there is a lobe that cannot be followed: the disc.
     lost        no part of the kernel was found to lie on the surface.
+    light       radiance by how it came (layers.Light); radius: bandwidth, world units. None where
+                nobody asks.
     """
 
     lane: Any
@@ -89,6 +91,8 @@ class Gathered:
     capped: Any
     degenerate: Any
     lost: Any
+    light: Any = None
+    radius: Any = None
 
 
 def kernels(points: GatherPoints, radius, options: KernelOptions) -> tuple[PlaneKernel, Any, Any]:

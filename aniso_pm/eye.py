@@ -25,6 +25,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from . import layers
 from .index import curve_order
 from .lobe_path import GlossyVertex, follow, no_lobe
 from .rays import largest_coordinate, spawn_ray
@@ -96,6 +97,8 @@ class WalkOptions:
     roughness      smallest alpha that is gathered on.
     measure        keep the length of the path at gather points.
     thinning       which paths leave gather points; None: all do.
+    light          split light by how it came (see ``layers``).
+    surface        keep what is seen.
     """
 
     use: str
@@ -110,6 +113,8 @@ class WalkOptions:
     roughness: float
     measure: bool = False
     thinning: Thinning | None = None
+    light: bool = False
+    surface: bool = False
 
 
 @dataclass
@@ -126,6 +131,7 @@ class GatherPoints:
     caustic    only caustic photons are to be read; None where all points agree. (survey: they are
                the map's only if it holds caustics alone.)
     distance   length of the path from the camera, world units; None where nobody asks.
+    later      has the path left a gathered part before? None where nobody asks, or none has.
     """
 
     lane: Any
@@ -139,6 +145,7 @@ class GatherPoints:
     lambertian: Any
     caustic: Any
     distance: Any = None
+    later: Any = None
 
 
 def map_tree(function, *trees: Any) -> Any:
@@ -166,7 +173,8 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     """Trace camera paths: (radiance, valid, GatherPoints or None).
 
     radiance  W/m²/sr: emission, direct light, and whatever the map does not stand for. NaN where
-              the throughput at a gather point is not finite. Parts where use is "survey".
+              the throughput at a gather point is not finite. Parts where use is "survey",
+              layers.Seen where somebody asks for layers.
     valid     did the ray meet anything but null surfaces and, if they are hidden, emitters?
               (alpha, as in ``path``)
     expected  gather points to make room for; with too few the same paths are traced again.
@@ -235,6 +243,7 @@ def _point(o: WalkOptions, lane, si, ray, weight, depth, path, lambertian, scatt
         lambertian=lambertian if o.general else None,
         caustic={"final_gather": ~scattered, "survey": scattered}.get(o.use),
         distance=distance if o.measure else None,
+        later=scattered if o.light and o.use != "global" else None,
     )
 
 
@@ -267,6 +276,7 @@ def _walk(scene, sampler, ray, options, push, see):
     delta_prev = mi.Bool(True)  # Was it a delta distribution (or the camera)?
     path = _first_lobe(o)
     distance = mi.Float(0)  # Length of the path
+    trail = layers.begin(o.light, o.surface)  # What it keeps for layers, if anybody asks
     # What the survey tells apart: found beyond a gathered part; over walked parts beyond one, and
     # the throughput of emission there; had the path left a gathered part before its last vertex?
     survey = o.use == "survey"
@@ -297,6 +307,8 @@ def _walk(scene, sampler, ray, options, push, see):
         mis = dr.select(delta_prev, 1, _power_heuristic(pdf_prev, pdf_emitter))
         emission = mis * ds.emitter.eval(si, seen)
         L[seen] = dr.fma(β_direct, emission, L)
+        if dr.hint(trail is not None, mode="scalar"):
+            trail.emission(β_direct * emission, seen)
         if dr.hint(survey, mode="scalar"):
             later[seen & before] += channel_mean(β_direct * emission)
             caustic[seen & before] += channel_mean(β_caustic * emission)
@@ -319,6 +331,10 @@ def _walk(scene, sampler, ray, options, push, see):
                 later[sample_light & scattered] += channel_mean(f * light)
                 caustic[sample_light & scattered] += channel_mean((whole - f) * light)
         L[sample_light] = dr.fma(f, light, L)
+        if dr.hint(trail is not None, mode="scalar"):
+            trail.direct_light(
+                o.use, bsdf, si, wo, f * light, f, o.roughness, scattered, sample_light
+            )
 
         # --- Leave a gather point ---
         is_receiver, lambertian, brdf = read_receiver(bsdf, si, o.roughness, o.general, active)
@@ -329,7 +345,7 @@ def _walk(scene, sampler, ray, options, push, see):
         here &= dr.max(weight) != 0
         if dr.hint(o.follow_lobes, mode="scalar"):
             path.distance += dr.select(active, si.t, 0)
-        if dr.hint(o.measure, mode="scalar"):
+        if dr.hint(o.measure or o.surface, mode="scalar"):
             distance += dr.select(active, si.t, 0)
         if dr.hint(o.gathers, mode="scalar"):
             L[here & ~finite] = dr.nan  # counted and dropped later
@@ -350,8 +366,13 @@ def _walk(scene, sampler, ray, options, push, see):
             f_g = gathered_part(bsdf, si, bs.wo, o.roughness, mixed & ~delta)
             f = bsdf.eval(ctx, si, bs.wo, mixed & ~delta)
             share = dr.select(f > 0, dr.clip(f_g / f, 0, 1), 0)
-            share = dr.select(share > 1 - 1e-5, 1, share)  # rounding leaves nothing to walk on
+            # rounding leaves nothing to walk on
+            share = mi.Spectrum(dr.select(share > 1 - 1e-5, 1, share))
             g = dr.select(mixed, dr.select(delta, 0, share), g)
+        if dr.hint(trail is not None, mode="scalar"):
+            trail.scatter(o.use, g, scattered)
+            solid = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+            trail.see(si, β * weight, distance, is_receiver, solid)
         if dr.hint(o.follow_lobes, mode="scalar"):
             path = follow(path, bsdf, si, ray, bs, active & ~(dr.min(g) == 1))
         valid |= on_surface & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
@@ -390,7 +411,8 @@ def _walk(scene, sampler, ray, options, push, see):
             if dr.hint(survey, mode="scalar"):
                 β_caustic *= scale
         depth += 1
-    return (Parts(L, later, caustic) if survey else L), valid
+    kept = layers.Seen(L, trail.light, trail.surface) if trail is not None else L
+    return (Parts(L, later, caustic) if survey else kept), valid
 
 
 def _power_heuristic(a, b):

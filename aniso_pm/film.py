@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -30,7 +31,7 @@ def sample_rays(sensor, sampler, pixel, wavelength):
     film = sensor.film()
     width, _ = sampled_size(film)
     row = pixel // width
-    corner = mi.Point2i(mi.Int32(pixel - row * width), mi.Int32(row)) - _border(film)
+    corner = mi.Point2i(mi.Int32(pixel - row * width), mi.Int32(row)) - border(film)
     corner += mi.Point2i(mi.ScalarPoint2i(film.crop_offset()))
 
     position = mi.Point2f(corner) + sampler.next_2d()
@@ -85,11 +86,7 @@ def splat(film, position, radiance, valid, spp, wavelengths, weight=None):
             radiance, wavelengths, block.channel_count(), mi.Float(1), alpha
         )
     else:
-        rgb = radiance
-        if mi.is_spectral:
-            rgb = mi.spectrum_to_srgb(radiance, wavelengths)
-        elif mi.is_monochromatic:
-            rgb = mi.Color3f(radiance.x)
+        rgb = to_rgb(radiance, wavelengths)
         channels = [rgb.x, rgb.y, rgb.z]
         if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
             channels.append(alpha)
@@ -100,6 +97,31 @@ def splat(film, position, radiance, valid, spp, wavelengths, weight=None):
     image = block.tensor()
     dr.eval(image)
     return image
+
+
+def to_rgb(spectrum, wavelengths):
+    """A value of each lane in linear sRGB. wavelengths: nm, in spectral variants."""
+    if mi.is_spectral:
+        return mi.spectrum_to_srgb(spectrum, wavelengths)
+    return mi.Color3f(spectrum.x) if mi.is_monochromatic else spectrum
+
+
+def splat_channels(film, position, channels, spp, weight=None, box=False) -> np.ndarray:
+    """As :func:`splat` for values of any meaning, weight last: float64, height × width ×
+    channels. box: weighted by a box filter, not by the film's."""
+    like = film.create_block()
+    rfilter = mi.load_dict({"type": "box"}) if box else film.rfilter()
+    block = mi.ImageBlock(
+        like.size(),
+        like.offset(),
+        len(channels) + 1,
+        rfilter,
+        False,
+        coalesce=like.coalesce() and spp >= 4,
+    )
+    channels = [*channels, mi.Float(1)]
+    block.put(position, channels if weight is None else [c * weight for c in channels])
+    return block.tensor().numpy().astype(np.float64)
 
 
 def show(film, image):
@@ -127,6 +149,7 @@ def describe(film) -> dict[str, Any]:
         "crop_size": [int(n) for n in film.crop_size()],
         "crop_offset": [int(n) for n in film.crop_offset()],
         "formats": formats,
+        "filter": pixel_weights(film),
     }
 
 
@@ -167,11 +190,24 @@ def noise_share(film) -> float:
     return float(((f**2).mean() / f.mean() ** 2 / (2 * radius)) ** 2)
 
 
-def _border(film) -> int:
+def pixel_weights(film) -> list[float]:
+    """Means of the reconstruction filter over whole pixels along a line, normalised, the middle
+    one in the middle: [1] for a box."""
+    rfilter = film.rfilter()
+    reach = math.ceil(rfilter.radius() - 0.5 - 1e-4)
+    steps = 2 * reach + 1
+    x = (dr.arange(mi.Float, steps * _STEPS) + 0.5) / _STEPS - 0.5 * steps
+    f = np.broadcast_to(rfilter.eval(x).numpy(), steps * _STEPS)
+    mean = f.reshape(steps, _STEPS).mean(1, dtype=np.float64)
+    return (mean / mean.sum()).tolist()
+
+
+def border(film) -> int:
+    """Pixels around the crop window that are sampled."""
     return film.rfilter().border_size() if film.sample_border() else 0
 
 
 def sampled_size(film) -> tuple[int, int]:
     """(width, height) of the pixels that are sampled."""
     width, height = film.crop_size()
-    return width + 2 * _border(film), height + 2 * _border(film)
+    return width + 2 * border(film), height + 2 * border(film)

@@ -1,4 +1,4 @@
-"""Pictures on disk: the film as OpenEXR with everything that made it, and a PNG to look at.
+"""Pictures on disk: the film as OpenEXR with everything that made it (PNG: see ``display``).
 
 Files appear whole or not at all: they are written under another name in the same directory and
 renamed. Whether that can work is found out before the render (:func:`check_writable`), not after.
@@ -79,21 +79,31 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def write_exr(film, path: Path, record: Mapping[str, Any], variance=None) -> None:
+def write_exr(
+    film,
+    path: Path,
+    record: Mapping[str, Any],
+    variance=None,
+    layers: Mapping[str, Any] | None = None,
+) -> None:
     """Write ``film`` with all its channels as OpenEXR.
 
     ``record`` (nested mappings) goes into the header twice: whole, as JSON, in the attribute
     ``aniso_pm``; and flat, one attribute ``aniso_pm.outer.inner`` for each number or text.
 
     ``variance`` (height × width × channels R, G, B, perhaps A), that of the picture, adds the
-    layers ``variance`` and ``standard_error``, its root. All channels are float32 then: half
-    precision has no room for a variance of 1e-8.
+    layers ``variance`` and ``standard_error``, its root; ``layers`` (height × width × channels)
+    others by name. All channels are float32 then: half precision has no room for a variance of
+    1e-8, nor for positions.
     """
     import mitsuba as mi
 
     bitmap = film.bitmap()
+    more = {name: layer for name, layer in (layers or {}).items() if layer.ndim == 3}
     if variance is not None:
-        bitmap = _with_layers(bitmap, {"variance": variance, "standard_error": variance**0.5})
+        more |= {"variance": variance, "standard_error": variance**0.5}
+    if more:
+        bitmap = _with_layers(bitmap, more)
     # Only its text tells in which format the film wants to be stored. Pictures with AOVs stay
     # float32: Mitsuba's conversion renames such channels and then fails to find them.
     elif "component_format = float16" in str(film):
@@ -117,6 +127,8 @@ def _with_layers(bitmap, layers: Mapping[str, Any]):
     import mitsuba as mi
     import numpy as np
 
+    from .layers import CHANNELS
+
     pixels = np.array(bitmap, dtype=np.float32)
     parts = [pixels.reshape(*pixels.shape[:2], -1)]
     names = [part.name for part in bitmap.struct_()]
@@ -125,7 +137,9 @@ def _with_layers(bitmap, layers: Mapping[str, Any]):
         count = values.shape[2]
         # Sums are R, G, B, whatever the film makes of them, unless it is a spectral one.
         own = [name for name in names if "." not in name][:count]
-        names += [f"{layer}.{channel}" for channel in ("RGBA"[:count] if count <= 4 else own)]
+        letters = CHANNELS.get(layer, "RGBA")
+        channels = letters[:count] if count <= len(letters) else "RGBA" if count == 4 else own
+        names += [f"{layer}.{channel}" for channel in channels]
     pixels = np.concatenate(parts, axis=2)
     return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names)
 
@@ -142,22 +156,3 @@ def _flatten(prefix: str, value: Any) -> Iterator[tuple[str, str | int | float]]
         yield prefix, json.dumps(value, ensure_ascii=False)
     elif value is not None:
         yield prefix, value
-
-
-def write_png(film, path: Path) -> None:
-    """Write the colour (and alpha) channels of ``film`` as an 8-bit sRGB PNG, clipped at 1."""
-    import mitsuba as mi
-
-    parts = film.bitmap().split()
-    colour = next((bitmap for name, bitmap in parts if name == "<root>"), None)
-    Format = mi.Bitmap.PixelFormat
-    if colour is None or colour.pixel_format() == Format.MultiChannel:
-        raise OutputError(f"cannot write '{path}': the film has no colour channels")
-    has_alpha = colour.pixel_format() in (Format.YA, Format.RGBA, Format.XYZA)
-    picture = colour.convert(
-        pixel_format=Format.RGBA if has_alpha else Format.RGB,
-        component_format=mi.Struct.Type.UInt8,
-        srgb_gamma=True,
-    )
-    with replacing(path) as partial:
-        picture.write(str(partial))

@@ -471,7 +471,7 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
                 viewed = _viewed(si, bs.wo)
                 f_g = gathered_part(bsdf, viewed, si.wi, o.roughness, smooth)
                 f = bsdf.eval(mi.BSDFContext(), viewed, si.wi, smooth)
-                g = dr.select(smooth & (f > 0), dr.clip(f_g / f, 0, 1), 0)
+                g = mi.Spectrum(dr.select(smooth & (f > 0), dr.clip(f_g / f, 0, 1), 0))
                 chance = channel_mean(g)
                 gathers = is_receiver & (lambertian | (sampler.next_1d(active) < chance))
                 part = dr.select(gathers, g / chance, (1 - g) / (1 - chance))

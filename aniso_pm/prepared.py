@@ -11,11 +11,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import density, emission, eye, photons, summed
+from . import density, emission, eye, layers, photons, summed
 from .aim import Aim
 from .footprint import TRIED, Footprint
 from .needs import Needs, read_scene
 from .settings import Settings
+from .split import split
 
 # Independent streams of random numbers.
 EYE, PROBE, PHOTONS, PILOT, COLOUR, THINNING = range(6)
@@ -32,11 +33,13 @@ class Radiance:
     L         radiance, W/m²/sr, per eye path.
     valid     alpha is 1, per eye path.
     gathered  density.Gathered of all gather points, a list: Lambertian receivers, other ones.
+    seen      layers.Seen, where somebody asks for layers.
     """
 
     L: Any
     valid: Any
     gathered: list[density.Gathered]
+    seen: layers.Seen | None = None
 
 
 @dataclass(frozen=True)
@@ -172,6 +175,17 @@ class Prepared:
             self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
         )
 
+    @property
+    def light_layers(self) -> bool:
+        """Does anybody ask for light by how it came?"""
+        return any(name in layers.LIGHT for name in self.settings.layer_names)
+
+    @property
+    def surface_layers(self) -> bool:
+        """Does anybody ask for what eye paths see?"""
+        wanted = (*layers.SURFACE, "denoising")
+        return any(name in wanted for name in self.settings.layer_names)
+
     def photon_map(
         self,
         seed: int,
@@ -189,10 +203,11 @@ class Prepared:
         if not self.needs_map:
             return photons.EMPTY
         s = self.settings
+        plain = "marked" if self.light_layers else "ignored"
         options = photons.TraceOptions(
             s.depth_limit - 1,
             s.rr_depth,
-            {"global": "ignored", "caustic": "only"}.get(self.use, "marked"),
+            {"global": plain, "caustic": "only"}.get(self.use, "marked"),
             bool(self.needs.general),
             s.gather_roughness,
             bool(self.needs.unseen),
@@ -218,9 +233,12 @@ class Prepared:
             lap("index")
         return map_
 
-    def trace(self, sampler, ray, expected: int = 0, see=None, thinning=None):
+    def trace(
+        self, sampler, ray, expected: int = 0, see=None, thinning=None, for_layers: bool = False
+    ):
         """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``, and
-        ``eye.eye_paths`` for ``see``, ``eye.Thinning``."""
+        ``eye.eye_paths`` for ``see``, ``eye.Thinning``. for_layers: keep what layers need that are
+        asked for."""
         s = self.settings
         options = eye.WalkOptions(
             self.use,
@@ -235,12 +253,21 @@ class Prepared:
             s.gather_roughness,
             self.footprint is not None and self.needs_map,
             thinning,
+            for_layers and self.light_layers,
+            for_layers and self.surface_layers,
         )
         launch = partial(self.launch.eye, see=see) if see else self.launch.eye
         return eye.trace(self.scene, sampler, ray, options, expected, launch)
 
     def gather(
-        self, map_, radius, seed: int, points: eye.GatherPoints, wavelengths=None, scores=None
+        self,
+        map_,
+        radius,
+        seed: int,
+        points: eye.GatherPoints,
+        wavelengths=None,
+        scores=None,
+        for_layers: bool = False,
     ) -> list[density.Gathered]:
         """Reflected radiance at gather points, edges compensated where that is asked for.
 
@@ -249,9 +276,10 @@ class Prepared:
         wavelengths  nm, of the eye paths, in spectral variants.
         scores       None, or a column of zeros, one for each photon, and the weight of each eye
                      path (see ``density.estimate``).
+        for_layers   find what layers need that are asked for.
         """
         if points.lambertian is None:
-            return [self._gather(map_, radius, seed, points, None, scores)]
+            return [self._gather(map_, radius, seed, points, None, scores, for_layers)]
         parts = []
         for general in (False, True):
             index = dr.compress(points.lambertian != general)
@@ -261,7 +289,7 @@ class Prepared:
                 if general:
                     roughness = self.settings.gather_roughness
                     surface = density.Surface.at(self.scene, some, roughness, wavelengths)
-                parts.append(self._gather(map_, radius, seed, some, surface, scores))
+                parts.append(self._gather(map_, radius, seed, some, surface, scores, for_layers))
         return parts
 
     def bandwidth(self, points: eye.GatherPoints, radius):
@@ -277,7 +305,7 @@ class Prepared:
             return radius
         return radius * self.footprint.share(points.distance, points.lane, TRIED)
 
-    def _gather(self, map_, radius, seed, points, surface, scores) -> density.Gathered:
+    def _gather(self, map_, radius, seed, points, surface, scores, for_layers) -> density.Gathered:
         if scores is not None:
             scores = scores[0], dr.gather(mi.Float, scores[1], points.lane)
         thickness = self.thickness(points, radius)
@@ -294,14 +322,32 @@ class Prepared:
             self.settings.gather_tolerance,
             scores,
         )
+        light: Any = None
+        if for_layers and self.light_layers:
+            light = split(
+                L,
+                self.use,
+                bool(self.needs.unseen),
+                map_,
+                points,
+                kernel,
+                thickness,
+                self.gather_depth,
+                surface,
+                self.settings.gather_tolerance,
+            )
         lost = mi.Bool(False)
         if self.settings.edge_compensation:
             inverse, lost = density.probe_surface(
                 self.scene, seed, points, kernel, thickness, count > 0
             )
             L *= inverse
+            light = eye.map_tree(lambda part: part * inverse, light)
         clamped, capped = follows & kernel.clamped, follows & kernel.capped
         found = density.Gathered(points.lane, L, count, follows, clamped, capped, degenerate, lost)
+        if for_layers:
+            wanted = "radius" in self.settings.layer_names
+            found = replace(found, light=light, radius=mi.Float(radius) if wanted else None)
         # One kernel for all of it: a reduction by itself would run the whole gather again.
         dr.eval(found)
         return found
@@ -316,27 +362,42 @@ class Prepared:
         expected: int = 0,
         lap=lambda stage: None,
         thinning: eye.Thinning | None = None,
+        for_layers: bool = False,
     ) -> Radiance:
         """Radiance along camera rays: their own share and the map's.
 
         radius    bandwidth, world units: a Dr.Jit array.
-        seed      of the random numbers that density estimation takes.
-        expected  gather points to make room for.
-        lap       called with the name of each stage that ends.
-        thinning  which eye paths gather; None: all.
+        seed        of the random numbers that density estimation takes.
+        expected    gather points to make room for.
+        lap         called with the name of each stage that ends.
+        thinning    which eye paths gather; None: all.
+        for_layers  find what layers need that are asked for.
         """
-        L, valid, points = self.trace(sampler, ray, expected, thinning=thinning)
+        L, valid, points = self.trace(
+            sampler, ray, expected, thinning=thinning, for_layers=for_layers
+        )
         lap("eye")
-        gathered = []
+        gathered, seen = [], None
+        if isinstance(L, layers.Seen):
+            seen, L = L, L.radiance
         if points is not None and map_.stored:
-            gathered = self.gather(map_, radius, seed, points, map_.wavelengths)
+            gathered = self.gather(
+                map_, radius, seed, points, map_.wavelengths, for_layers=for_layers
+            )
+
+            def add(total, part, lane):
+                # Directly: sums of each thread's own would have their size in the code.
+                dr.scatter_add(total, part, lane, mode=dr.ReduceMode.Direct)
+                return total
+
             L = mi.Spectrum(L)
             for found in gathered:
-                # Directly: sums of each thread's own would have their size in the code.
-                dr.scatter_add(L, found.radiance, found.lane, mode=dr.ReduceMode.Direct)
-            dr.eval(L)
+                add(L, found.radiance, found.lane)
+                if found.light is not None:
+                    eye.map_tree(partial(add, lane=found.lane), seen.light, found.light)
+            dr.eval(L, seen)
         lap("gather")
-        return Radiance(L, valid, gathered)
+        return Radiance(L, valid, gathered, seen)
 
 
 def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:

@@ -20,12 +20,13 @@ import numpy as np
 
 from . import advice, digest, footprint, memory, state
 from . import film as films
-from .accumulate import Sums, mean_and_variance, relative_standard_error
+from .accumulate import NAMES, Sums, mean_and_variance, relative_standard_error
 from .allotment import Allotment
 from .arrays import own
 from .clock import Clock
 from .errors import Failed, is_interrupt
 from .eye import Thinning
+from .layered import Layered, plus, whole_pass
 from .pilot import Settled, photons_per_path, settle
 from .prepared import EYE, PROBE, THINNING, Prepared, stream_seed
 from .schedule import bandwidth, shares, wavelength_sample
@@ -61,6 +62,8 @@ class Controls:
     callback    called as callback(pass_index, image, statistics) after every pass: the picture so
                 far as a tensor, and the statistics so far.
     checkpoint  where to keep the state.
+    so_far      called as so_far(variance, layers, passes), as in ``Rendered``, before somebody else
+                looks at the picture so far.
     settled     what a pilot has chosen, on another machine; None: one will choose here.
     elsewhere   who renders the passes, if not this process: called with the ``Run``, gives them as
                 ``Batch``es. progress and callback are then called after each of those.
@@ -70,6 +73,7 @@ class Controls:
     progress: Callable[[float, int | None, str], None] | None = None
     callback: Callable[[int, Any, dict], None] | None = None
     checkpoint: state.Checkpoint | None = None
+    so_far: Callable[[Any, Any, int], None] | None = None
     settled: Settled | None = None
     elsewhere: Callable[[Run], Iterator[Batch]] | None = None
 
@@ -79,7 +83,7 @@ class Batch:
     """Passes that were rendered together.
 
     passes   half-open ranges of their numbers (see ``state.State``).
-    arrays   ``Sums.arrays()`` of them.
+    arrays   ``Sums.arrays()`` of them, and the sums of their layers.
     counts   what they counted.
     seconds  that each stage took.
     """
@@ -94,12 +98,15 @@ class Batch:
 class Rendered:
     """What is left of a rendering beside the film: the scene with what was chosen for it, map and
     radius of the last pass (None if no pass was rendered), variance of the picture (None with one
-    pass)."""
+    pass), sums of the layers that were asked for (see ``layered``; None: none were) over so many
+    passes."""
 
     scene: Prepared
     map: Any
     radius: float | None
     variance: np.ndarray | None
+    layers: dict[str, np.ndarray] | None
+    passes: int
 
 
 def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, statistics: dict):
@@ -134,7 +141,7 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
     run.finish()
     advice.after(scene, statistics)
     decided = replace(run.scene.thawed(), footprint=None)
-    return Rendered(decided, run.map, run.radius, run.variance)
+    return Rendered(decided, run.map, run.radius, run.variance, run.done.layers, run.passes)
 
 
 class _Done(NamedTuple):
@@ -143,6 +150,7 @@ class _Done(NamedTuple):
     sums: Sums | None
     passes: list[list[int]]
     counts: dict[str, int]
+    layers: dict[str, np.ndarray] | None = None
 
 
 class _Room:
@@ -174,7 +182,9 @@ class Run:
         self.map = self.radius = self.variance = None
         self.done = _Done(None, [], dict.fromkeys((*_COUNTS, "passes"), 0))
         self.photons, self.points = _Room(), _Room()
-        self.unfinished = None  # (image, counts) of the pass that is being rendered
+        self.layered = Layered.of(self.film, scene.settings.layer_names)
+        self.layers: dict[str, np.ndarray] | None = None  # of the pass that is being rendered
+        self.unfinished = None  # (image, counts, layers) of the pass that is being rendered
 
     # --- Before the first pass ---
 
@@ -250,6 +260,7 @@ class Run:
         bound = min(s.depth_limit, s.rr_depth + 20) * s.photon_count if scene.needs_map else 0
         at_once = pixels * self._samples_at_once(self.shares.each + bool(self.shares.one_more))
         channels = self.film.create_block().channel_count()
+        channels += self.layered.channels if self.layered else 0
         job = memory.Job(bound, pixels, channels, self.keeps_variance, at_once)
         return job, lambda: photons_per_path(scene, self.seed) * s.photon_count
 
@@ -276,7 +287,8 @@ class Run:
                 f"but passes {wanted} are asked for"
             )
         counts = {name: earlier.statistics[name] for name in self.done.counts}
-        self.done = _Done(Sums.from_arrays(earlier.arrays), earlier.passes, counts)
+        sums = Sums.from_arrays(earlier.arrays)
+        self.done = _Done(sums, earlier.passes, counts, earlier.layer_sums() or None)
         self.stopping.spent_before = earlier.seconds
         self.statistics |= counts
         self.clock.go_on_from(earlier.statistics["seconds"])
@@ -315,7 +327,8 @@ class Run:
                 sums = Sums.zeros(image.shape, self.keeps_variance)
             total = {name: n + counts.get(name, 1) for name, n in self.done.counts.items()}
             passes = state.extended(self.done.passes, index)
-            self.done = _Done(sums.plus(image), passes, total)
+            layers = self.layers and plus(self.done.layers, whole_pass(self.layers))
+            self.done = _Done(sums.plus(image), passes, total, layers)
             self.unfinished = None
             self.statistics |= {**total, "radius": self.radius}
             estimate = self.plan.with_stored(self.photons.most).bytes / memory.GIB
@@ -327,21 +340,23 @@ class Run:
 
     def begin(self):
         """Forget all passes that are done."""
-        self.done = _Done(None, [], dict.fromkeys(self.done.counts, 0))
+        self.done = _Done(None, [], dict.fromkeys(self.done.counts, 0), None)
         self.clock.seconds.clear()
 
     def batch(self) -> Batch:
         """The passes since ``begin``."""
-        sums, passes, counts = self.done
-        return Batch(passes, sums.arrays(), counts, dict(self.clock.seconds))
+        sums, passes, counts, layers = self.done
+        return Batch(passes, sums.arrays() | (layers or {}), counts, dict(self.clock.seconds))
 
     def add(self, batch: Batch):
         """Passes that were rendered elsewhere, and what is due after them."""
-        sums, passes, counts = self.done
+        sums, passes, counts, layers = self.done
         more = Sums.from_arrays(batch.arrays)
         sums = more if sums is None else sums.joined(more)
         total = {name: n + batch.counts[name] for name, n in counts.items()}
-        self.done = _Done(sums, state.joined([*passes, *batch.passes]), total)
+        others = {name: array for name, array in batch.arrays.items() if name not in NAMES}
+        layers = plus(layers, others) if others else layers
+        self.done = _Done(sums, state.joined([*passes, *batch.passes]), total, layers)
         self.clock.go_on_from(batch.seconds)
         last = self.done.passes[-1][1] - 1
         self.radius = bandwidth(self.radius0, self.scene.settings.alpha, last)
@@ -353,7 +368,7 @@ class Run:
     def _trace_pass(self, index: int):
         """(image as film blocks hold it, counts) of one pass."""
         # --- Photons ---
-        self.unfinished = None
+        self.unfinished = self.layers = None
         self.radius = bandwidth(self.radius0, self.scene.settings.alpha, index)
         colour = wavelength_sample(self.seed, index)
         wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
@@ -369,7 +384,7 @@ class Run:
         # --- Eye paths ---
         share = self.shares(index)
         for image, done in self._eye_pass(index, share, colour, counts):
-            self.unfinished = image, dict(counts)
+            self.unfinished = image, dict(counts), self.layers
             if done < 1:
                 self._report(index, done)
         counts["spp"] = share
@@ -403,7 +418,9 @@ class Run:
                 scene = replace(scene, footprint=pixel.seen_by(lanes.pixel))
             seed = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
             room = self.points.room
-            seen = scene.radiance(sampler, ray, map_, radius, seed, room, self.clock.lap, thinning)
+            seen = scene.radiance(
+                sampler, ray, map_, radius, seed, room, self.clock.lap, thinning, True
+            )
             self._count(seen.gathered, counts)
 
             # --- Into the image ---
@@ -413,6 +430,11 @@ class Run:
             splats = films.splat(film, position, L, seen.valid, each, ray.wavelengths, lanes.weight)
             image = splats if image is None else image + splats
             dr.eval(image)
+            if self.layered is not None:
+                found = self.layered.wavefront(
+                    position, L, seen.seen, seen.gathered, ray, ray_weight, lanes, finite, each
+                )
+                self.layers = plus(self.layers, found)
             self.clock.lap("film")
             counts["eye_samples"] += lanes.count
             counts["spp"] = int(spp * done)
@@ -437,6 +459,11 @@ class Run:
         if asked and self.stopping.is_checkpoint(self.done.counts["passes"]):
             self._estimate_error()
 
+    @property
+    def passes(self) -> int:
+        """Whole ones that are done."""
+        return self.done.counts["passes"]
+
     def _estimate_error(self):
         sums, count = self.done.sums, self.done.counts["passes"]
         if count > 1 and sums.square is not None:
@@ -452,7 +479,9 @@ class Run:
         if self.scene.settings.passes:
             number += f"/{self.controls.first_pass + self.scene.settings.passes}"
         text = number + (f", error {error:.2%}" if error else "")
-        self.controls.progress(count + part if part < 1 else count, total, text)
+        with self.stopping.not_counted():
+            self.controls.progress(count + part if part < 1 else count, total, text)
+        self.clock.lap("output")
 
     def report_elsewhere(self, count: int):
         """Tell that ``count`` passes are rendered, not all of which are here."""
@@ -467,10 +496,14 @@ class Run:
         due = checkpoint is not None and checkpoint.due()
         if due or callback:
             films.show(self.film, self.done.sums.film_tensor())
+            if due:
+                self._estimate_error()
+            if self.controls.so_far:
+                self.controls.so_far(self.variance, self.done.layers, self.passes)
         if callback:
-            callback(index, self.film.develop(), dict(self.statistics))
+            with self.stopping.not_counted():
+                callback(index, self.film.develop(), dict(self.statistics))
         if due:
-            self._estimate_error()
             checkpoint.write(self._state())
             if checkpoint.on_write:
                 checkpoint.on_write()
@@ -484,7 +517,7 @@ class Run:
             self.done.passes,
             self.stopping.spent(),
             self.statistics,
-            self.done.sums.arrays(),
+            self.done.sums.arrays() | (self.done.layers or {}),
         )
 
     # --- At the end ---
@@ -493,9 +526,9 @@ class Run:
         """After an interruption: is there a picture? Whole passes only, or the wavefronts of the
         first one."""
         if self.done.sums is None and self.unfinished is not None:
-            image, counts = self.unfinished
+            image, counts, layers = self.unfinished
             sums = Sums.zeros(image.shape, False).plus(image)
-            self.done = _Done(sums, [], counts | {"passes": 0})
+            self.done = _Done(sums, [], counts | {"passes": 0}, layers)
         return self.done.sums is not None
 
     def finish(self):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 
+from . import layers
 from .kernel import RULES
 
 _UNLIMITED = 0xFFFFFFFF
@@ -36,6 +37,7 @@ class Settings:
     max_depth: int = -1
     rr_depth: int = 5
     max_memory: float = 0.0
+    layers: str = ""
 
     def __post_init__(self):
         for field in fields(self):
@@ -74,6 +76,11 @@ class Settings:
         self._between("max_depth", -1, 10**6, "-1 (unlimited) or 1 and more", self.max_depth != 0)
         self._between("rr_depth", 1, 10**6)
         self._between("max_memory", 0, 1e6, "0 (automatic) or a positive number of GiB")
+        if "standard_error" in self.layer_names and self.passes == 1:
+            raise ValueError(
+                'aniso_pm: parameter "layers" asks for "standard_error", which is the spread of '
+                'passes, but there is one; set "passes" to 2 or more'
+            )
 
     def _one_of(self, name, *choices):
         value = getattr(self, name)
@@ -89,6 +96,11 @@ class Settings:
                 f'aniso_pm: parameter "{name}" is {value}; '
                 f"it must be {words or f'between {low:g} and {high:g}'}"
             )
+
+    @property
+    def layer_names(self) -> tuple[str, ...]:
+        """The layers that are asked for."""
+        return layers.parse(self.layers)
 
     @property
     def open_ended(self) -> bool:

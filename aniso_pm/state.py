@@ -1,9 +1,10 @@
 """The state of an unfinished rendering on disk: passes done, their sums, what they depend on.
 
-Format: a NumPy archive (.npz) of the arrays first, square, cross (see ``accumulate``) and "header",
-JSON text with the format's version, the identity (see ``digest``), the passes as half-open ranges,
-statistics, the seconds spent, and a SHA-256 of all the rest. Files appear whole or not at all and
-are never trusted: what is truncated, altered or of another version is refused.
+Format: a NumPy archive (.npz) of the arrays first, square, cross (see ``accumulate``), layers where
+there are any (see ``layered``), and "header", JSON text with the format's version, the identity
+(see ``digest``), the passes as half-open ranges, statistics, the seconds spent, and a SHA-256 of
+all the rest. Files appear whole or not at all and are never trusted: what is truncated, altered or
+of another version is refused.
 """
 
 from __future__ import annotations
@@ -22,9 +23,12 @@ import numpy as np
 from . import output
 from .accumulate import mean_and_variance
 from .digest import differences
+from .layered import develop
+from .layers import parse
 
 VERSION = 1
 _ARRAYS = ("first", "square", "cross")
+_OPTIONAL = ("layers", "denoising")
 
 
 class StateError(ValueError):
@@ -40,7 +44,7 @@ class State:
     passes      half-open ranges of pass numbers, ascending, disjoint and not touching.
     seconds     rendering time spent on them.
     statistics  of the renderer, over these passes.
-    arrays      ``Sums.arrays()``.
+    arrays      ``Sums.arrays()``, and the sums of layers that were asked for (``layered``).
     """
 
     identity: dict[str, Any]
@@ -58,6 +62,18 @@ class State:
     def variance(self) -> np.ndarray | None:
         """Variance of the picture, height × width × channels; None with one pass."""
         return mean_and_variance(self.arrays, self.count)[1] if self.count > 1 else None
+
+    def layer_sums(self) -> dict[str, np.ndarray]:
+        """The sums of layers; see ``layered``."""
+        return {name: self.arrays[name] for name in _OPTIONAL if name in self.arrays}
+
+    def layers(self) -> dict[str, np.ndarray]:
+        """The layers that were asked for; see ``layered.develop``."""
+        sums = self.layer_sums()
+        if not sums:
+            return {}
+        names = parse(self.identity['parameter "layers"'])
+        return develop(names, sums, self.count, self.film["filter"])
 
     def save(self, path: Path) -> None:
         """Write atomically, down to the disk. Raises ``output.OutputError``."""
@@ -77,7 +93,8 @@ class State:
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
                 header = json.loads(str(archive["header"]))
-                arrays = {name: archive[name] for name in _ARRAYS}
+                there = [name for name in _OPTIONAL if name in archive]
+                arrays = {name: archive[name] for name in (*_ARRAYS, *there)}
             version, checksum = header["version"], header.pop("sha256")
         except Exception as error:
             reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
@@ -177,7 +194,7 @@ def joined(passes) -> list[list[int]]:
 
 def _checksum(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
     sha = hashlib.sha256(json.dumps(header, sort_keys=True, ensure_ascii=False).encode())
-    for name in _ARRAYS:
+    for name in (*_ARRAYS, *(name for name in _OPTIONAL if name in arrays)):
         array = np.ascontiguousarray(arrays[name])
         sha.update(f"{name} {array.dtype} {array.shape}".encode())
         sha.update(array.data)

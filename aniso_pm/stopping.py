@@ -1,9 +1,9 @@
 """When to stop: number of passes, time, estimated error, whichever comes first.
 
-Time is wall-clock time from the call on, without the compilation of kernels: that happens once, in
-the first pass, and depends on what is cached. Rendering ends as near to the limit as whole passes
-allow: one more begins if, by the mean of the last ones, half of it will lie within. The first pass
-always does.
+Time is wall-clock time from the call on, without the compilation of kernels, which happens once, in
+the first pass, and depends on what is cached, and without what callbacks take. Rendering ends as
+near to the limit as whole passes allow: one more begins if, by the mean of the last ones, half of
+it will lie within. The first pass always does.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ class Stopping:
         self.spent_before = 0.0  # by earlier runs that this one resumes
         self._began = time.perf_counter()
         self._compiling = 0.0
+        self._elsewhere = 0.0
         self._durations: list[float] = []
         # A history that the caller keeps is the caller's; then compilation counts as rendering.
         self._history = settings.time > 0 and not dr.flag(dr.JitFlag.KernelHistory)
@@ -42,12 +43,21 @@ class Stopping:
     @contextmanager
     def measured(self):
         """Around each pass."""
-        began, compiling = time.perf_counter(), self._compiling
+        began, aside = time.perf_counter(), self._compiling + self._elsewhere
         yield
         if self._history:
             self._close_history()
-        took = time.perf_counter() - began - (self._compiling - compiling)
+        took = time.perf_counter() - began - (self._compiling + self._elsewhere - aside)
         self._durations = [*self._durations[-_RECENT + 1 :], took]
+
+    @contextmanager
+    def not_counted(self):
+        """Around what others do, who may take any time."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._elsewhere += time.perf_counter() - began
 
     def close(self):
         """At the end, however it came."""
@@ -66,13 +76,14 @@ class Stopping:
         """Seconds of compilation, and what else does not count, so far."""
         return self._compiling
 
-    def not_counted(self, seconds: float):
+    def set_aside(self, seconds: float):
         """So many seconds since the beginning were no rendering."""
-        self._compiling += seconds
+        self._elsewhere += seconds
 
     def spent(self) -> float:
-        """Seconds spent, earlier runs included, compilation not."""
-        return self.spent_before + time.perf_counter() - self._began - self._compiling
+        """Seconds spent, earlier runs included, compilation and what others do not."""
+        aside = self._compiling + self._elsewhere
+        return self.spent_before + time.perf_counter() - self._began - aside
 
     def is_checkpoint(self, count: int) -> bool:
         """Is the error estimated after ``count`` passes? After each of the first 20, then at steps

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm import progressive
+from aniso_pm.film import pixel_weights as film_weights
+from aniso_pm.layered import develop
 from aniso_pm.pilot import USUAL, automatic_radius
 from aniso_pm.prepared import Unsupported, prepare
 from aniso_pm.settings import Settings
@@ -156,6 +159,21 @@ class AnisoPhotonMapper:
          first pass. An estimate: the peak may be half as much again. 0 takes three quarters of what
          is available, to this process's control group or on the CUDA device. (Default: 0)
 
+     * - layers
+       - |string|
+       - Layers that are kept beside the picture, separated by commas. Light by how it came, the sum
+         of which is the picture: ``direct`` (emitters that are seen, and what they light directly),
+         ``caustic`` (over glass, mirrors and smooth metal alone) and ``indirect`` (the rest), each
+         at the first receiver that the eye path meets. What is seen: ``albedo`` and ``normal``
+         (world space) at that receiver, through mirrors, glass and glossy metal; ``depth``
+         (distance from the camera) and ``position`` of the first surface. What was done:
+         ``samples`` of each pixel, mean ``radius`` of its kernels (world units), and
+         ``standard_error`` (two passes or more). ``denoising`` is what a denoiser needs: picture,
+         albedo and normal as a box filter gives them and, from eight passes on, the picture's
+         standard error, as the layers ``denoising_picture``, ``denoising_albedo``,
+         ``denoising_normal`` and ``denoising_error``. All are in the attribute ``layers``, and in
+         the EXR that :monosp:`aniso-pm render` writes. (Default: none)
+
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: |false|)
@@ -165,10 +183,12 @@ class AnisoPhotonMapper:
     surfaces, the diffuse part of ``plastic`` and ``roughplastic``, and surfaces whose roughness is
     at least ``gather_roughness``. Photons and eye paths walk on all others, as ``path`` does.
 
-    After ``render()`` the attribute ``statistics`` holds counts and timings. After two passes or
-    more ``variance`` holds the variance of the picture (NumPy array, height × width × channels),
-    estimated from the spread of the passes; its root is the standard error. Passes share one
-    stratified sequence, so that their mean is better than their spread says: an upper estimate.
+    After ``render()`` the attribute ``statistics`` holds counts and timings, and ``layers`` the
+    layers that were asked for, NumPy arrays (height × width × 1 or 3 channels) by name. After two
+    passes or more ``variance`` holds the variance of the picture (NumPy array, height × width ×
+    channels), estimated from the spread of the passes; its root is the standard error. Passes
+    share one stratified sequence, so that their mean is better than their spread says: an upper
+    estimate.
 
     Eye paths take their random numbers from an ``owen_sobol`` sequence that goes on from pass to
     pass, whatever the sampler of the scene, which says only how many samples there are. That number
@@ -180,7 +200,8 @@ class AnisoPhotonMapper:
 
     Before ``render()`` these attributes may be set: ``progress``, a function (done, total, text)
     that is called after each wavefront (see ``aniso_pm.progress.bar``); ``callback``, a function
-    (pass_index, image, statistics) that is called after each pass with the picture so far;
+    (pass_index, image, statistics) that is called after each pass with the picture so far, when
+    ``variance`` and ``layers`` hold those so far;
     ``checkpoint``, an ``aniso_pm.state.Checkpoint`` that keeps the state of the rendering in a file
     from which it can be resumed; ``first_pass``, the number of the first pass. Pass i is the same
     whatever passes are rendered before or after it, or none; ``elsewhere``, who renders the passes
@@ -230,6 +251,7 @@ class AnisoPhotonMapper:
         self.settings = Settings(**given)
         self.statistics: dict[str, Any] = {}
         self.variance: np.ndarray | None = None
+        self.layers: dict[str, np.ndarray] = {}
         self.progress: Callable[[float, int | None, str], None] | None = None
         self.callback: Callable[[int, Any, dict], None] | None = None
         self.checkpoint: Checkpoint | None = None
@@ -259,20 +281,22 @@ class AnisoPhotonMapper:
         total, and without a limit to their number that of each."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[int(sensor)]
-        self.statistics, self.variance, self._last_map = {}, None, None
+        self.statistics, self.variance, self._last_map, self.layers = {}, None, None, {}
         with dr.suspend_grad():
             prepared = prepare(scene, self.settings, self.hide_emitters)
+            so_far = partial(self._so_far, film_weights(sensor.film()))
             controls = progressive.Controls(
                 self.first_pass,
                 self.progress,
                 self.callback,
                 self.checkpoint,
+                so_far,
                 elsewhere=self.elsewhere,
             )
             done = progressive.render(
                 prepared, sensor, _as_int(seed), spp, controls, self.statistics
             )
-            self.variance = done.variance
+            so_far(done.variance, done.layers, done.passes)
             if done.map:
                 self._last_map = (scene, done.scene, done.map, done.radius)
             image = sensor.film().develop() if develop else mi.TensorXf()
@@ -316,6 +340,13 @@ class AnisoPhotonMapper:
         raise NotImplementedError(_NO_DERIVATIVES)
 
     # --- Ours ---
+
+    def _so_far(self, weights, variance, sums, passes):
+        names = self.settings.layer_names
+        self.variance = variance
+        self.layers = {} if sums is None else develop(names, sums, passes, weights)
+        if "standard_error" in names and variance is not None:
+            self.layers["standard_error"] = np.sqrt(variance[..., :3]).astype(np.float32)
 
     def stop_after(self, passes: int = 0, time: float = 0.0, target_error: float = 0.0) -> None:
         """Replace the stopping rules by these, whichever comes first; 0 is no limit. Raises

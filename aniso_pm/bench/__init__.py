@@ -3,8 +3,9 @@
 Speeds are ratios within one run wherever that is possible: the machine they were measured on is
 then of little importance. A module of measurements is one idea and has a function
 ``measure(quick)`` that yields rows: ``gathering`` and its data (``walls``) and rivals (``grid``),
-``building``, ``tracing``, ``passes``, ``memory``, ``startup``, ``kernels``, ``errors``. ``row``
-says what a row is and prints it, ``timing`` takes the time, ``rooms`` has the scenes.
+``building``, ``tracing``, ``passes``, ``memory``, ``startup``, ``kernels``, ``errors``,
+``denoising``. ``row`` says what a row is and prints it, ``timing`` takes the time, ``rooms`` has
+the scenes.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ GROUPS = {
     "startup": "startup",
     "kernels": "kernels",
     "error": "errors",
+    "denoise": "denoising",
 }
 
 

@@ -16,7 +16,7 @@ from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import Failed, InputError, is_interrupt, one_line
 
-from . import bench, cluster, examine, explain, reference, render, report, scenes
+from . import bench, cluster, examine, explain, reference, render, report, scenes, view
 from .common import INTERRUPTED, InterruptError
 
 app = typer.Typer(
@@ -79,6 +79,7 @@ def _program(
 for command in (
     render.render,
     render.merge,
+    view.view,
     reference.reference,
     report.report,
     scenes.scenes,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from aniso_pm import _llvm, output
@@ -20,6 +21,16 @@ Variant = Annotated[str, typer.Option("--variant", "-m", help="Variant.")]
 Define = Annotated[
     list[str] | None,
     typer.Option("--define", "-D", metavar="KEY=VALUE", help="Parameter $KEY of the scene."),
+]
+Integrator = Annotated[
+    str | None,
+    typer.Option(
+        "--integrator", metavar="NAME", help="Integrator to take instead of the scene's own."
+    ),
+]
+Parameter = Annotated[
+    list[str] | None,
+    typer.Option("-p", metavar="NAME=VALUE", help="Parameter of the integrator."),
 ]
 
 
@@ -35,14 +46,31 @@ def make_directory(path: Path) -> None:
     output.check_writable(path / "any.json")
 
 
-def parse_defines(pairs: list[str]) -> dict[str, str]:
+def parse_defines(pairs: list[str], option: str = "-D takes KEY=VALUE") -> dict[str, str]:
     defines = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not key or not equals:
-            raise InputError(f"-D takes KEY=VALUE, not '{pair}'")
+            raise InputError(f"{option}, not '{pair}'")
         defines[key] = value
     return defines
+
+
+def parse_parameters(pairs: list[str] | None) -> dict[str, Any]:
+    """Parameters of an integrator, NAME=VALUE: numbers, true or false, text."""
+    texts = parse_defines(pairs or [], "-p takes NAME=VALUE")
+    return {name: _value(text) for name, text in texts.items()}
+
+
+def _value(text: str) -> Any:
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 def set_variant(variant: str) -> None:
@@ -61,8 +89,18 @@ def set_variant(variant: str) -> None:
         raise InputError(f"variant '{variant}' cannot be used: {reason}") from error
 
 
-def load(scene: Path, defines: dict[str, str], sensor: int):
-    """Scene, sensor and integrator; whatever is wrong with them is an InputError."""
+def load(
+    scene: Path,
+    defines: dict[str, str],
+    sensor: int,
+    integrator_name: str | None = None,
+    parameters: dict[str, Any] | None = None,
+):
+    """Scene, sensor and integrator; whatever is wrong with them is an InputError.
+
+    integrator_name  plugin to take instead of the scene's own integrator.
+    parameters       of that plugin, or to change those of an ``aniso_pm`` in the scene.
+    """
     import mitsuba as mi
 
     try:
@@ -77,9 +115,8 @@ def load(scene: Path, defines: dict[str, str], sensor: int):
 
     if not isinstance(world, mi.Scene):
         raise InputError(f"{scene}: the file describes a {type(world).__name__}, not a scene")
-    sensors, integrator = world.sensors(), world.integrator()
-    if integrator is None:
-        raise InputError(f"{scene}: the scene names no integrator")
+    sensors = world.sensors()
+    integrator = _integrator(scene, world.integrator(), integrator_name, parameters or {})
     if not sensors:
         raise InputError(f"{scene}: the scene has no sensor")
     if sensor >= len(sensors):
@@ -89,10 +126,40 @@ def load(scene: Path, defines: dict[str, str], sensor: int):
     return world, sensors[sensor], integrator
 
 
+def _integrator(scene: Path, own, name: str | None, parameters: dict[str, Any]):
+    """The integrator to render with: ``own``, another one, or ``own`` with other parameters."""
+    import mitsuba as mi
+
+    if name is None and own is None:
+        raise InputError(f"{scene}: the scene names no integrator; give one, --integrator aniso_pm")
+    if name is None and not parameters:
+        return own
+    if name is None:
+        if not hasattr(own, "settings"):
+            raise InputError(
+                f"-p: the scene's integrator is {own.class_name()}; parameters of an integrator "
+                "that is not aniso_pm are given together with --integrator"
+            )
+        before = own.parameters()
+        if {"time", "target_error"} & parameters.keys():
+            del before["passes"]  # another rule takes its place, as in a scene
+        name, parameters = "aniso_pm", before | parameters
+    try:
+        found = mi.load_dict({"type": name, **parameters})
+    except Exception as error:
+        raise InputError(f"--integrator {name}: {one_line(error)}") from error
+    if not isinstance(found, mi.Integrator):
+        raise InputError(f"--integrator {name}: this plugin is no integrator")
+    return found
+
+
 @contextmanager
 def mitsuba_log(quiet: bool) -> Iterator[None]:
-    """Send Mitsuba's warnings to standard error, one line each, instead of standard output."""
+    """Send Mitsuba's warnings to standard error, one line each and each once, instead of standard
+    output; how many came again is said at the end."""
     import mitsuba as mi
+
+    said: Counter[str] = Counter()
 
     class StandardError(mi.Appender):
         def append(self, level, text) -> None:
@@ -101,7 +168,10 @@ def mitsuba_log(quiet: bool) -> Iterator[None]:
                 message = re.sub(
                     r"^\s*(\[[^]]*\]\s*)?\w+\(\): ", "", message
                 )  # where it was logged
-                print(f"aniso-pm: warning: {one_line(message.strip())}", file=sys.stderr)
+                message = one_line(message.strip())
+                said[message] += 1
+                if said[message] == 1:
+                    print(f"aniso-pm: warning: {message}", file=sys.stderr)
 
         def log_progress(self, *_) -> None:
             pass
@@ -116,3 +186,7 @@ def mitsuba_log(quiet: bool) -> Iterator[None]:
         logger.clear_appenders()
         for appender in before:
             logger.add_appender(appender)
+        again = said.total() - len(said)
+        if again:
+            came = "warning came again and is" if again == 1 else "warnings came again and are"
+            print(f"aniso-pm: {again} {came} not repeated", file=sys.stderr)

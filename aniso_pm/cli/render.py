@@ -17,14 +17,18 @@ from aniso_pm.progress import bar
 from .common import (
     INTERRUPTED,
     Define,
+    Integrator,
     InterruptError,
+    Parameter,
     SceneFile,
     Variant,
     load,
     mitsuba_log,
     parse_defines,
+    parse_parameters,
     set_variant,
 )
+from .pictures import Bits, Denoise, Exposure, Pictures, Png, Tonemap
 from .workers import (
     Mixed,
     Scheduler,
@@ -80,13 +84,23 @@ def render(
     tls_ca_file: TlsCa = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
-    png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
+    integrator_name: Integrator = None,
+    parameter: Parameter = None,
+    layer_names: Annotated[
+        str | None,
+        typer.Option("--layers", metavar="NAMES", help="Layers to write as well: direct,albedo,…"),
+    ] = None,
+    denoise: Denoise = False,
+    png: Png = False,
+    exposure: Exposure = 0.0,
+    tonemap: Tonemap = "srgb",
+    bits: Bits = 8,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no warnings.")] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
     ] = False,
 ) -> int:
-    """Render a scene with the integrator it names and write the picture as OpenEXR.
+    """Render a scene with the integrator it names, or another one, and write it as OpenEXR.
 
     The header of the picture records parameters, seed, versions, timings and statistics. With
     several passes the layers "variance" and "standard_error" tell how noisy the picture is.
@@ -100,14 +114,14 @@ def render(
     --workers 4 renders the passes in four processes of this machine, --scheduler or
     --scheduler-file on the workers of a Dask cluster, with the same picture. Whoever can reach a
     Dask scheduler can run code on its workers: use TLS, or a network of your own.
+
+    --layers takes albedo, normal, depth, position, direct, caustic, indirect, samples, radius,
+    standard_error, denoising (see the integrator's parameter of that name). --denoise leaves the
+    picture as it was rendered and adds a layer, denoised; it asks for the layers of denoising.
     """
     # --- Find out what would fail, before anything slow ---
-    defines = parse_defines(define or [])
-    if out.suffix.lower() != ".exr":
-        raise InputError(f"cannot write '{out}': the output's name must end in .exr")
-    picture = out.with_suffix(".png") if png else None
-    for path in filter(None, [out, picture]):
-        output.check_writable(path)
+    defines, parameters = parse_defines(define or []), parse_parameters(parameter)
+    pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
     if not scene.is_file():
         raise InputError(f"{scene}: there is no such file")
 
@@ -115,22 +129,24 @@ def render(
     with mitsuba_log(quiet):
         # --- Load the scene ---
         started = time.perf_counter()
-        world, camera, integrator = load(scene, defines, sensor)
+        world, camera, integrator = load(scene, defines, sensor, integrator_name, parameters)
         loaded = time.perf_counter()
         rules = {"passes": passes, "time": seconds, "target_error": target_error}
         rules = {name: value for name, value in rules.items() if value is not None}
         kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state)
+        _ask_for_layers(integrator, layer_names, denoise)
+        from aniso_pm.film import pixel_weights
+
         made_by = {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
 
         def write() -> dict[str, Any]:
             """Write the picture so far and what made it."""
-            record = _record(integrator, camera) | made_by
+            record = record_of(integrator, camera) | made_by
             now = time.perf_counter()
             record["seconds"] = {"load": loaded - started, "render": now - loaded}
             variance = getattr(integrator, "variance", None)
-            output.write_exr(camera.film(), out, record, variance)
-            if picture:
-                output.write_png(camera.film(), picture)
+            layers = getattr(integrator, "layers", None)
+            pictures.write(camera.film(), record, variance, layers, pixel_weights(camera.film()))
             return record
 
         # --- Render ---
@@ -165,10 +181,10 @@ def render(
             state_file.unlink(missing_ok=True)
 
     if as_json:
-        record |= {"output": str(out), "png": str(picture) if picture else None}
+        record |= {"output": str(out), "png": str(pictures.png) if pictures.png else None}
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
     elif not quiet:
-        print(_done(record, out, picture))
+        print(_done(record, out, pictures.png))
     if statistics.get("failure"):
         done = f"{statistics['passes']} passes" if statistics["passes"] else "part of a pass"
         print(
@@ -191,7 +207,11 @@ def merge(
     first_pass: Annotated[
         int, typer.Option(min=0, max=10**7, help="Number of the first of those.")
     ] = 0,
-    png: Annotated[bool, typer.Option("--png", help="Also write an sRGB PNG beside it.")] = False,
+    denoise: Denoise = False,
+    png: Png = False,
+    exposure: Exposure = 0.0,
+    tonemap: Tonemap = "srgb",
+    bits: Bits = 8,
     as_json: Annotated[
         bool, typer.Option("--json", help="Say on standard output what was done, as JSON.")
     ] = False,
@@ -207,11 +227,7 @@ def merge(
     from aniso_pm.state import State, StateError, describe, missing
     from aniso_pm.state import merge as merged
 
-    if out.suffix.lower() != ".exr":
-        raise InputError(f"cannot write '{out}': the output's name must end in .exr")
-    picture = out.with_suffix(".png") if png else None
-    for path in filter(None, [out, picture]):
-        output.check_writable(path)
+    pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
     try:
         loaded = [
             str(name.with_suffix(".state") if name.suffix.lower() == ".exr" else name)
@@ -243,9 +259,8 @@ def merge(
         "statistics": total.statistics,
         "depends_on": total.identity,
     }
-    output.write_exr(film, out, record, total.variance())
-    if picture:
-        output.write_png(film, picture)
+    weights = total.film.get("filter", [1.0])
+    pictures.write(film, record, total.variance(), total.layers(), weights)
     total.save(out.with_suffix(".state"))
     if record["missing"]:
         count = sum(end - start for start, end in record["missing"])
@@ -254,7 +269,7 @@ def merge(
             file=sys.stderr,
         )
     if as_json:
-        record |= {"output": str(out), "png": str(picture) if picture else None}
+        record |= {"output": str(out), "png": str(pictures.png) if pictures.png else None}
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
     return 0
 
@@ -282,6 +297,21 @@ def _prepare_passes(
             raise InputError(one_line(error)) from error
     integrator.first_pass = first_pass
     return keep_state if keep_state or integrator.settings.passes != 1 else None
+
+
+def _ask_for_layers(integrator, layers: str | None, denoise: bool) -> None:
+    """Set the layers to be kept; an InputError where the integrator has none."""
+    if not hasattr(integrator, "settings"):
+        if layers:
+            raise InputError(f"--layers: {integrator.class_name()} has none; aniso_pm does")
+        return
+    asked = integrator.settings.layers if layers is None else layers
+    if denoise:
+        asked += ",denoising"
+    try:
+        integrator.settings = integrator.settings.with_(layers=asked.strip(","))
+    except ValueError as error:
+        raise InputError(one_line(error)) from error
 
 
 def _render(world, camera, integrator, seed: int, spp: int | None, quiet: bool) -> None:
@@ -314,7 +344,8 @@ def _done(record: dict[str, Any], out: Path, picture: Path | None) -> str:
     return f"{', '.join(str(path) for path in (out, picture) if path)}: {', '.join(parts)}"
 
 
-def _record(integrator, camera) -> dict[str, Any]:
+def record_of(integrator, camera) -> dict[str, Any]:
+    """What made a picture, for its header."""
     from aniso_pm.doctor import versions
 
     statistics = dict(getattr(integrator, "statistics", None) or {})

@@ -268,13 +268,13 @@ class _Dispatch:
         now = time.monotonic()
         if what == "start":
             if self.began:  # the time for processes to start and to load the scene does not count
-                self.run.stopping.not_counted(now - self.began)
+                self.run.stopping.set_aside(now - self.began)
                 self.began = 0.0
             carrier.places, carrier.started = frozenset([news["worker"]]), now
             carrier.due = now + self.pace.limit(carrier.passes)
         elif what == "end":
             if self.pace.each is None:
-                self.run.stopping.not_counted(news["compiling"])
+                self.run.stopping.set_aside(news["compiling"])
             carrier.places = frozenset([news["worker"]])
             self.pace.seen(news["seconds"], carrier.passes, news["first"])
         elif what == "done":

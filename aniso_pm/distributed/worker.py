@@ -163,7 +163,8 @@ class _Rendering:
             self.run.render_pass(index)
         batch = self.run.batch()
         if not self.variance:
-            batch = replace(batch, arrays={"first": batch.arrays["first"]})
+            kept = {k: v for k, v in batch.arrays.items() if k not in ("square", "cross")}
+            batch = replace(batch, arrays=kept)
         return batch, self.run.stopping.compiling - compiled
 
 
