@@ -87,13 +87,15 @@ def _mend():
 def test_workers_render_the_same_picture_as_one_process(client):
     seen = []
     # A pilot chooses everything, pixel by pixel.
-    chosen = scene(map="auto", photon_count=0, initial_radius=0.0)
+    chosen = scene(map="auto", photon_count=0, initial_radius=0.0, layers="direct,caustic,indirect")
     done = render(
         chosen, client, spp=36, seed=3, passes=12, progress=lambda *what: seen.append(what)
     )
     image, variance, statistics = alone(chosen, 36, 3, passes=12)
     assert_same_picture(done.image, image)
     np.testing.assert_allclose(done.variance, variance, rtol=0.02, atol=1e-7)
+    # The parts of the light come home as well, and are all of it.
+    assert_same_picture(sum(done.layers.values()), image)
     for name in ("passes", "spp", "photons_emitted", "eye_samples", "map"):
         assert done.statistics[name] == statistics[name], name
     assert done.statistics["radius"] == pytest.approx(statistics["radius"], rel=1e-6)

@@ -33,11 +33,13 @@ class Result:
     image       height × width × channels, as the film develops it.
     variance    of the picture (height × width × channels), None after one pass.
     statistics  as an integrator's.
+    layers      that the integrator was asked for, by their names.
     """
 
     image: np.ndarray
     variance: np.ndarray | None
     statistics: dict[str, Any]
+    layers: dict[str, np.ndarray]
 
 
 def render(
@@ -117,7 +119,7 @@ def _render(
         setattr(integrator, name, value)
     integrator.elsewhere = Elsewhere(client, parcel, sensor, options)
     image = integrator.render(world, sensor=sensor, seed=seed, spp=spp)
-    result = Result(np.array(image), integrator.variance, integrator.statistics)
+    result = Result(np.array(image), integrator.variance, integrator.statistics, integrator.layers)
     if failure := result.statistics.get("failure"):
         failed = Failed(
             f"{failure}; {result.statistics['passes']} passes are in the picture so far"
