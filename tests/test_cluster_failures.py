@@ -139,7 +139,7 @@ def test_a_worker_that_hangs_is_replaced_and_its_passes_are_rendered(capfd):
 
         from aniso_pm import distributed
 
-        options = Options(task_seconds=0.3, task_limit=4.0, home_every=0.5, keep=2)
+        options = Options(task_seconds=0.3, task_limit=12.0, home_every=0.5, keep=2)
         made = distributed.Elsewhere
         distributed.Elsewhere = lambda *arguments: made(*arguments, warn=told.append)
         try:

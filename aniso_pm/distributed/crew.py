@@ -77,7 +77,8 @@ class Crew:
         self._hear()
         if self.good or self._joining:
             self._some = now
-        elif now - self._some > (_GRACE if self.refused else self._patience):
+        # Who was slow may come back, or be started again.
+        elif now - self._some > (_GRACE if self.refused and not self._slow else self._patience):
             raise Failed(self._nobody())
 
     def refuse(self, address: str, reason: str, slow: bool = False) -> None:

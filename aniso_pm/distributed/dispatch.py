@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import math
 import queue
+import threading
 import time
 import uuid
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import mitsuba as mi
@@ -86,6 +87,8 @@ class _Carrier:
     places: frozenset[str] = frozenset()
     done: bool = False
     started: float | None = None
+    fetching: bool = False
+    made: float = field(default_factory=time.monotonic)
 
 
 class Elsewhere:
@@ -147,6 +150,7 @@ class _Dispatch:
         self.ledger = Ledger(first, count, run.done.passes)
         self.carriers: dict[str, _Carrier] = {}
         self.homing: _Carrier | None = None  # the sum of all, on its way home
+        self.fetched: dict[str, Any] = {}  # sums that came home, or why they did not
         self.events: queue.SimpleQueue = queue.SimpleQueue()
         self.began = self.home = time.monotonic()
         self.home_cost = 0.0
@@ -279,6 +283,8 @@ class _Dispatch:
             self.pace.seen(news["seconds"], carrier.passes, news["first"])
         elif what == "done":
             self._done(carrier)
+        elif what == "fetched":
+            self.fetched[carrier.key] = news["found"]
 
     def _done(self, carrier: _Carrier) -> None:
         if carrier.future.status == "finished":
@@ -306,15 +312,24 @@ class _Dispatch:
             due = carrier.due
             if idle and carrier.renders and carrier.started and not carrier.done:
                 due = min(due, carrier.started + self.pace.limit(carrier.passes, idle=True))
-            if now < due:
+            if now < due or carrier.key not in self.carriers:
                 continue
+            places = [] if self.enough else self._where(carrier)
             self._lost(carrier)
             if self.enough:
                 continue
             self.pace.too_long()
-            if carrier.renders and carrier.started:
-                for address in carrier.places:
-                    self._hangs(address, now - carrier.started)
+            for address in places:
+                self._hangs(address, now - (carrier.started or carrier.made))
+
+    def _where(self, carrier: _Carrier) -> list[str]:
+        """Workers that a late carrier is late because of: that which renders it; or that which has
+        it and does not begin, though it renders nothing else."""
+        if carrier.done or carrier.started:
+            return sorted(carrier.places) if carrier.renders else []
+        busy = frozenset().union(*(c.places for c in self.rendering if c.started))
+        having = self.client.processing().items()
+        return [w for w, keys in having if carrier.key in keys and w not in busy]
 
     def _hangs(self, address: str, seconds: float) -> None:
         """What a worker has that hangs is lost."""
@@ -400,12 +415,13 @@ class _Dispatch:
             carrier.done, carrier.due = False, time.monotonic() + 3 * self.pace.limit(1)
             self._watch(carrier)
             return
-        self.homing = None
-        try:
-            found = carrier.future.result(timeout=max(60.0, self.pace.limit(1)))
-        except Exception as error:
-            if is_interrupt(error):
-                raise
+        if not carrier.fetching:
+            carrier.fetching, carrier.due = True, time.monotonic() + 3 * self.pace.limit(1)
+            threading.Thread(target=self._fetch, args=[carrier], daemon=True).start()
+        if carrier.key not in self.fetched:
+            return
+        self.homing, found = None, self.fetched.pop(carrier.key)
+        if isinstance(found, BaseException):
             self._lost(carrier)
             return
         if self.ledger.count(carrier.key):
@@ -413,6 +429,14 @@ class _Dispatch:
         self._drop(carrier)
         self.home_cost = time.monotonic() - self.home
         self.home = time.monotonic()
+
+    def _fetch(self, carrier: _Carrier) -> None:
+        """In a thread: the worker that has the sum may hang, which others have to notice."""
+        try:
+            found = carrier.future.result()
+        except Exception as error:
+            found = error
+        self.events.put({"what": "fetched", "task": carrier.key, "found": found})
 
     def _salvaged(self) -> Iterator[Batch]:
         """What is ready on the workers, if it comes soon."""
