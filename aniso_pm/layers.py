@@ -56,8 +56,8 @@ def parse(text: str) -> tuple[str, ...]:
     for name in asked:
         if name not in NAMES:
             raise ValueError(
-                f'aniso_pm: parameter "layers" names "{name}"; there are {", ".join(NAMES)}, '
-                "separated by commas"
+                f'aniso_pm: parameter "layers" is "{text}", but there is no layer "{name}"; it '
+                f"must be names out of {', '.join(NAMES)}, separated by commas"
             )
     return tuple(name for name in NAMES if name in asked)
 

@@ -238,7 +238,7 @@ def test_layers_and_denoised_picture_are_written_and_merged(run, tmp_path):  # n
 @pytest.mark.parametrize(
     "options, parts",
     [
-        (["--layers", "albedo,nothing"], ['names "nothing"', "albedo"]),
+        (["--layers", "albedo,nothing"], ['no layer "nothing"', "albedo"]),
         (["--bits", "12", "--png"], ["--bits is 12", "8 or 16"]),
         (["--exposure", "1"], ["add --png"]),
         (["--tonemap", "agx", "--png"], ["'agx'", "srgb, aces"]),

@@ -212,7 +212,7 @@ def test_nothing_is_traced_that_nobody_asks_for(variant_llvm_rgb, scene):
 
 
 def test_wrong_layers_are_told_in_a_sentence(variant_llvm_rgb):
-    with pytest.raises(ValueError, match='"layers" names "albeda"; there are direct, .*commas'):
+    with pytest.raises(ValueError, match='"layers" is .*no layer "albeda"; .*direct, .*commas'):
         Settings(layers="albedo,albeda")
     with pytest.raises(ValueError, match='asks for "standard_error".*set "passes" to 2'):
         Settings(layers="standard_error")

@@ -296,7 +296,7 @@ def _kernel(prepared: Prepared, point, radius: float, lost: bool):
     outlines = {"kernel": outline(plane.s, plane.t)}
     disc = density.disc(point.n, mi.Float(radius))
     outlines["disc"] = outline(disc.s, disc.t)
-    if follows and lobe is not None:
+    if follows and path is not None and lobe is not None:
         free = replace(options, guard=False)
         bare, _, _ = density.kernels(point, mi.Float(radius), free)
         outlines["unguarded"] = outline(bare.s, bare.t)
