@@ -23,10 +23,10 @@ def boxed(file: Path, defines: Mapping[str, str]):
     state = mi.parser.parse_file(config, str(file), **defines)
     mi.parser.transform_all(config, state)
     for film in [node for node in state.nodes if node.type == mi.ObjectType.Film]:
-        for name, value in film.props.items():
+        for name, value in list(film.props.items()):
             if isinstance(value, mi.Properties.ResolvedReference):
                 if state.nodes[value.index()].type == mi.ObjectType.ReconstructionFilter:
-                    film.props.remove_property(name)
+                    del film.props[name]
         box = mi.parser.SceneNode()
         box.type, box.props = mi.ObjectType.ReconstructionFilter, mi.Properties("box")
         state.nodes.append(box)
