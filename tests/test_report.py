@@ -12,8 +12,19 @@ import numpy as np
 import pytest
 from aniso_pm import cli, density
 from aniso_pm.errors import InputError
+from aniso_pm.film import pixel_weights
 from aniso_pm.prepared import prepare
-from aniso_pm.report import cells, experiment, make, methods, metrics, reference, regions, runs
+from aniso_pm.report import (
+    cells,
+    denoised,
+    experiment,
+    make,
+    methods,
+    metrics,
+    reference,
+    regions,
+    runs,
+)
 from aniso_pm.report.plan import Plan
 from aniso_pm.settings import Settings
 from conftest import tick
@@ -93,14 +104,17 @@ def results(out):
     return json.loads((out / "results.json").read_text())
 
 
+def schema():
+    text = resources.files("aniso_pm.report").joinpath("results.schema.json").read_text()
+    return json.loads(text)
+
+
 # --- Files ---
 
 
 def test_results_keep_to_their_schema(done):
-    schema = json.loads(
-        resources.files("aniso_pm.report").joinpath("results.schema.json").read_text()
-    )
-    jsonschema.validate(results(done), schema)
+    jsonschema.validate(results(done), schema())
+    assert not any(row["denoised"] for row in results(done)["rows"])
 
 
 def test_all_that_was_asked_for_is_in_the_table(done):
@@ -135,6 +149,66 @@ def test_page_needs_no_other_file_and_shows_every_figure(done):
     assert {"tiny-error-whole", "tiny-split-anisotropic", "tiny-bandwidth-large"} <= svgs
     assert svgs <= {p.stem for p in (done / "figures").glob("*.png")}
     assert text.count("data:image/svg+xml") == len(svgs)
+
+
+def test_denoised_rows_stand_beside_raw_ones(scene, tmp_path, monkeypatch, ticking):
+    monkeypatch.setattr(runs, "CALLS", (1,))
+    names = ("lobe/default", "path")
+    arguments = [word for name in names for word in ("--method", name)]
+    arguments += ["--time", "0.2", "--budgets", "2", "--denoise"]
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), *QUICK, *arguments]) == 0
+    found = results(tmp_path)
+    jsonschema.validate(found, schema())
+
+    last = found["plan"]["times"][-1]
+    rows = [r for r in found["rows"] if r["budget"] == last and r["region"] == "whole"]
+    assert [r["method"] for r in rows] == [n + more for n in names for more in ("", ", denoised")]
+    for before, after in zip(rows[::2], rows[1::2], strict=True):
+        assert after["denoised"] and not before["denoised"] and after["seeds"] == 3
+        assert after["variance"]["value"] < 0.7 * before["variance"]["value"], after["method"]
+        assert after["energy"]["value"] == pytest.approx(1, abs=0.1), after["method"]
+    pairs = {(r["method"], r["base"]) for r in found["ratios"]}
+    assert ("lobe/default, denoised", "path, denoised") in pairs
+    assert not any((", denoised" in one) != (", denoised" in other) for one, other in pairs)
+    text = (tmp_path / "index.html").read_text()
+    assert re.search(r'class="(limited )?denoised"><td>path <span class="mark">denoised<', text)
+
+
+def test_mitsubas_integrators_give_albedo_and_normal_where_they_can():
+    given = {kind: denoised.with_aovs({"type": kind}) for kind in ("path", "ptracer", "prb")}
+    assert [aovs for _, aovs in given.values()] == [True, False, False]
+    assert "albedo.R" in given["path"][0].aov_names()
+
+
+def test_films_are_boxed_whatever_filter_they_have(tmp_path):
+    texts = {"box": SCENE, "wide": SCENE.replace('type="box"', 'type="gaussian"')}
+    texts["none"] = SCENE.replace('<rfilter type="box"/>', "")
+    for name, text in texts.items():
+        file = tmp_path / f"{name}.xml"
+        file.write_text(text)
+        world = denoised.boxed(file, {"width": "20"})
+        film = world.sensors()[0].film()
+        assert pixel_weights(film) == [1.0] and list(film.size()) == [20, 24], name
+        assert len(world.shapes()) == len(mi.load_file(str(file), optimize=False).shapes())
+
+
+def test_mitsubas_pictures_get_their_own_filter_back_after_denoising():
+    """Calls are weighted by their samples; what is known beside a picture is as of ``aniso_pm``."""
+    random = np.random.default_rng(0)
+    calls = denoised.Calls([0.25, 0.5, 0.25], aovs=True)
+    truth = np.concatenate([np.full((12, 16, 3), 2.0), random.random((12, 16, 6))], 2)
+    for spp in (1, 4, 16) * 40:
+        noise = random.normal(size=(12, 16, 3)) / np.sqrt(spp)
+        calls.add(truth + np.concatenate([noise, np.zeros((12, 16, 6))], 2), spp)
+    found = calls.layers
+    np.testing.assert_allclose(found["denoising_albedo"], truth[..., 3:6])
+    np.testing.assert_allclose(found["denoising_normal"], truth[..., 6:])
+    assert found["denoising_picture"].mean() == pytest.approx(2, abs=0.01)
+    # 840 samples of variance 1.
+    error = np.sqrt((found["denoising_error"] ** 2).mean())
+    assert error == pytest.approx(840**-0.5, rel=0.05)
+    assert (found["denoising_picture"] - 2).std() == pytest.approx(840**-0.5, rel=0.15)
+    assert (calls.picture - 2).std() < 0.6 * (found["denoising_picture"] - 2).std()
 
 
 @pytest.mark.slow
@@ -280,6 +354,14 @@ def test_a_missing_package_is_named_with_its_remedy(scene, tmp_path, monkeypatch
     monkeypatch.setitem(sys.modules, "scipy", None)
     assert cli.main(["report", str(scene), "-o", str(tmp_path)]) == 2
     assert "pip install jinja2 matplotlib scipy" in capfd.readouterr().err
+
+
+def test_a_missing_denoiser_is_named_before_anything_runs(scene, tmp_path, monkeypatch, capfd):
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
+    assert cli.main(["report", str(scene), "-o", str(tmp_path), "--denoise"]) == 2
+    error = capfd.readouterr().err
+    assert "pip install 'aniso-pm[denoise]'" in error and error.count("\n") == 1
+    assert not (tmp_path / "cells").exists()
 
 
 def test_names_stand_for_methods():

@@ -48,6 +48,13 @@ def report(
     quick: Annotated[
         bool, typer.Option("--quick", help="A look: half a second, 3 seeds, 5 methods.")
     ] = False,
+    denoise: Annotated[
+        bool,
+        typer.Option(
+            "--denoise",
+            help="Measure denoised pictures beside the raw ones. Takes twice the time.",
+        ),
+    ] = False,
     variant: Variant = "llvm_ad_rgb",
     define: Define = None,
     sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
@@ -84,6 +91,7 @@ def report(
         "spp": spp,
     }
     asked = {name: value for name, value in asked.items() if value is not None}
+    asked["denoise"] = denoise
     plan = Plan.quickly(**asked) if quick else Plan(**asked)
     make_directory(out)
     visible = not quiet and sys.stderr.isatty()

@@ -6,6 +6,7 @@ from collections import Counter
 from typing import Any
 
 from . import regions
+from .methods import DENOISED
 
 # Pixels in which a comparison is made, if the scene has them; all of them else.
 _AGAINST_ISOTROPIC = (regions.ANISOTROPIC, regions.WHOLE)
@@ -32,7 +33,7 @@ def conclusions(results: dict[str, Any], scene: dict[str, Any]) -> list[dict[str
         found.append(
             last
             | {"label": labels[method], "base_label": labels[base]}
-            | {"base_kernel": base.partition("/")[0]}
+            | {"base_kernel": base.partition("/")[0].removesuffix(DENOISED)}
             | {"tally": dict(tally), "compared": len(clear)}
         )
     order = list(labels)

@@ -11,11 +11,12 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from aniso_pm import denoising
 from aniso_pm.doctor import versions
 from aniso_pm.errors import InputError, is_interrupt, one_line
 from aniso_pm.prepared import prepare
@@ -64,15 +65,18 @@ def measure(
     plan: Plan,
     store: Store,
     tick: Callable[[float, str], None],
+    boxed: Callable[[], tuple[Any, Any]] | None = None,
 ) -> Measured:
     """Run what ``plan`` asks of one scene and is not in ``store`` yet.
 
-    tick  called as tick(seconds, text) after each run with the seconds planned for it.
+    tick   called as tick(seconds, text) after each run with the seconds planned for it.
+    boxed  loads the scene and its camera with a box filter; called if ``plan.denoise`` asks for it.
+           None: the film has one.
 
     Raises InputError where the scene has no reference.
     """
     found = require_reference(file, world, sensor)
-    return _Experiment(file, world, sensor, plan, store, tick, found).run()
+    return _Experiment(file, world, sensor, plan, store, tick, found, boxed).run()
 
 
 def require_reference(file: Path, world, sensor) -> reference.Reference:
@@ -88,7 +92,7 @@ def require_reference(file: Path, world, sensor) -> reference.Reference:
 
 
 class _Experiment:
-    def __init__(self, file, world, sensor, plan, store, tick, found):
+    def __init__(self, file, world, sensor, plan, store, tick, found, boxed):
         self.world, self.sensor, self.plan, self.store = world, sensor, plan, store
         self.tick = tick
         self._warmed: dict[str, dict[str, Any]] = {}
@@ -98,8 +102,9 @@ class _Experiment:
         # Mitsuba's integrators do not know all of these names at their defaults.
         limits = {k: v for k, v in limits.items() if v not in (-1, False)}
         self.own = {k: v for k, v in own.items() if k not in _OURS}
+        boxed = cache(boxed) if boxed else None
         self.stages = {
-            name: runs.Stage(world, sensor, self.own, limits, size.photons, size.spp)
+            name: runs.Stage(world, sensor, self.own, limits, size.photons, size.spp, boxed)
             for name, size in plan.sizes.items()
         }
         self.fixed = {
@@ -129,8 +134,11 @@ class _Experiment:
             out.methods = [m for m in methods if prepared.follow_lobes or not _same(m, methods)]
             out.left_out = [m.name for m in methods if m not in out.methods]
             self._regions(prepared)
+        if plan.denoise:
+            out.methods = [one for m in out.methods for one in (m, m.with_denoising())]
         for method in out.methods:
-            if method.bandwidth == "best":
+            # The best bandwidth is that of the raw picture.
+            if method.bandwidth == "best" and not method.denoised:
                 for size in plan.sizes:
                     self._sweep(method, size)
 
@@ -221,6 +229,8 @@ class _Experiment:
                 for stage, radius, times in parts
             ],
         }
+        if method.denoised:
+            key["denoiser"] = denoising.check_installed().oidn_version()
 
         def make():
             found = None

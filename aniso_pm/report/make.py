@@ -6,15 +6,19 @@ import gc
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+from aniso_pm import denoising
 from aniso_pm.doctor import versions
 from aniso_pm.errors import InputError, one_line
+from aniso_pm.film import pixel_weights
 
 from . import page, pictures, results
 from .cells import Store
+from .denoised import boxed
 from .experiment import measure, require_reference
 from .machine import describe
 from .methods import parse_all
@@ -103,7 +107,9 @@ def report(
     parts, figures, found, path = [], {}, {}, directory
     for file in files:
         world, camera = load(file, defines, sensor)
-        measured = measure(file, world, camera, plan, store, tick)
+        wide = pixel_weights(camera.film()) != [1.0]
+        box = partial(_boxed, file, defines, sensor) if plan.denoise and wide else None
+        measured = measure(file, world, camera, plan, store, tick, box)
         parts.append(results.of_scene(measured, plan))
 
         # --- The report so far: what comes later may fail ---
@@ -119,9 +125,15 @@ def report(
         figures[measured.name] = page.write_figures(directory, found, found["scenes"][-1], panels)
         path = page.write_page(directory, found, figures)
         # The materials of a scene that is still there would be part of the next one's kernels.
-        del world, camera, measured
+        del world, camera, measured, box
         gc.collect()
     return Report(found, path, store.stale)
+
+
+def _boxed(file: Path, defines: Mapping[str, str], sensor: int):
+    """Scene and sensor with a box filter."""
+    world = boxed(file, defines)
+    return world, world.sensors()[sensor]
 
 
 def expected_seconds(plan: Plan) -> float:
@@ -131,7 +143,8 @@ def expected_seconds(plan: Plan) -> float:
     sweeps = sum(method.bandwidth == "best" for method in methods)
     tried = 6 if plan.fine else 4
     times = sum(size.sweep_seconds for size in plan.sizes.values())
-    return len(methods) * plan.seeds * plan.seconds + sweeps * tried * plan.sweep_seeds * times
+    runs = len(methods) * plan.seeds * (2 if plan.denoise else 1)
+    return runs * plan.seconds + sweeps * tried * plan.sweep_seeds * times
 
 
 def _check(files: list[Path], plan: Plan, defines, sensor: int) -> None:
@@ -143,6 +156,8 @@ def _check(files: list[Path], plan: Plan, defines, sensor: int) -> None:
         if names.count(name) > 1:
             raise InputError(f"report: two scenes are called '{name}'; rename one of the files")
     parse_all(plan.methods)
+    if plan.denoise:
+        denoising.check_installed()
     for file in files:
         if not file.is_file():
             raise InputError(f"{file}: there is no such file")

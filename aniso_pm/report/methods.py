@@ -10,7 +10,7 @@ two. Every other name is one of Mitsuba's integrators, perhaps with parameters:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from aniso_pm.errors import InputError
@@ -21,6 +21,8 @@ KERNELS = (ISOTROPIC, *RULES)
 BANDWIDTHS = ("default", "best")
 STANDARD = (ISOTROPIC, "lobe", "taylor", "paper", PATH, "ptracer")
 QUICK = (ISOTROPIC, "lobe", PATH)
+# At the end of the names and labels of denoised methods.
+DENOISED = ", denoised"
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,17 @@ class Method:
     name        as in the results: "lobe/best", "path:max_depth=8".
     plugin      type and parameters of the integrator that differ from the scene's own.
     bandwidth   "default", "best", or None where there are no kernels.
+    denoised    what is measured is its denoised picture.
     """
 
     name: str
     plugin: dict[str, Any]
     bandwidth: str | None = None
+    denoised: bool = False
+
+    def with_denoising(self) -> Method:
+        """This method with its pictures denoised."""
+        return replace(self, name=self.name + DENOISED, denoised=True)
 
     @property
     def ours(self) -> bool:
@@ -43,11 +51,13 @@ class Method:
     @property
     def kernel(self) -> str:
         """ "isotropic", or the rule; the plugin's name for Mitsuba's."""
-        return self.name.partition("/")[0]
+        return self.name.partition("/")[0].removesuffix(DENOISED)
 
     @property
     def label(self) -> str:
-        return f"{self.kernel}, {self.bandwidth} bandwidth" if self.ours else self.name
+        if not self.ours:
+            return self.name
+        return f"{self.kernel}, {self.bandwidth} bandwidth" + DENOISED * self.denoised
 
     @property
     def slug(self) -> str:

@@ -31,6 +31,8 @@ class Plan:
     sweep_seeds  runs at each bandwidth of a sweep.
     fine         try bandwidths in steps of √2, not of 2 only.
     quick        said on the page.
+    denoise      run every method a second time, with what denoising needs, and measure the denoised
+                 pictures as well.
 
     Raises InputError for values out of range.
     """
@@ -46,6 +48,7 @@ class Plan:
     sweep_seeds: int = 2
     fine: bool = True
     quick: bool = False
+    denoise: bool = False
 
     def __post_init__(self):
         for name, low, high in (

@@ -1,7 +1,8 @@
 """Figures of one scene, from the results alone: ``NAME → matplotlib Figure``.
 
 One curve a method, of the same colour everywhere; dashed at the default bandwidth, solid at the
-best one. Bars and bands are 95 % intervals. Hollow points are limited by the reference.
+best one; dots and dashes, and dots, where pictures are denoised. Bars and bands are 95 % intervals.
+Hollow points are limited by the reference.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def _ratios(scene, ratios, region) -> Figure:
         low = [v - (r["low"] or v) for v, r in zip(y, mine, strict=True)]
         high = [(r["high"] or v) - v for v, r in zip(y, mine, strict=True)]
         colour, mark = _colour(scene, method), _MARKS.get(method["plugin"].get("rule"), "o")
-        line = "-" if method["bandwidth"] == "best" else "--"
+        line = _line(method)
         ax.errorbar(x, y, (low, high), color=colour, lw=1.2, ls=line, capsize=2)
         for a, b, r in zip(x, y, mine, strict=True):
             ax.plot(a, b, mark, color=colour, mfc="white" if r["limited"] else colour, ms=5)
@@ -170,7 +171,7 @@ def _curve(ax, method, colour, rows) -> None:
     rows = [row for row in rows if row[y]["value"] and row[y]["value"] > 0]
     if not rows:
         return
-    line = "--" if method["bandwidth"] == "default" else "-"
+    line = _line(method)
     mark = _MARKS.get(method["label"].partition(",")[0], "P")
     seconds, values = [row["seconds"] for row in rows], [row[y]["value"] for row in rows]
     if all(row[y]["low"] is not None for row in rows):
@@ -184,12 +185,19 @@ def _curve(ax, method, colour, rows) -> None:
     ax.plot([], [], mark + line, color=colour, label=method["label"], ms=4.5)
 
 
+def _line(method) -> str:
+    default = method["bandwidth"] == "default"
+    if method["denoised"]:
+        return "-." if default else ":"
+    return "--" if default else "-"
+
+
 def _colour(scene, method) -> str:
     name = method["label"].partition(",")[0]
     if name in COLOURS:
         return COLOURS[name]
-    others = [m["name"] for m in scene["methods"] if m["label"].partition(",")[0] not in COLOURS]
-    return _MORE[others.index(method["name"]) % len(_MORE)]
+    others = [m["plugin"] for m in scene["methods"] if m["label"].partition(",")[0] not in COLOURS]
+    return _MORE[others.index(method["plugin"]) % len(_MORE)]
 
 
 def _budgets(ax, entries) -> None:

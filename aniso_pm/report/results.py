@@ -11,7 +11,7 @@ from aniso_pm import output
 
 from . import metrics, regions
 from .experiment import Measured
-from .methods import ISOTROPIC, Method
+from .methods import DENOISED, ISOTROPIC, Method
 from .plan import Plan
 from .runs import SET_UP
 
@@ -48,6 +48,7 @@ def of_scene(measured: Measured, plan: Plan) -> dict[str, Any]:
                 place = {
                     "scene": measured.name,
                     "method": method.name,
+                    "denoised": method.denoised,
                     "region": region,
                     "budget": budget,
                 }
@@ -89,8 +90,9 @@ def of_scene(measured: Measured, plan: Plan) -> dict[str, Any]:
 
 def bases(method: Method, methods: list[Method]) -> list[Method]:
     """What a method is compared with: the isotropic kernel at the same kind of bandwidth, and
-    ``path``, where they were run."""
-    found = []
+    ``path``, where they were run; raw pictures with raw ones, denoised with denoised ones."""
+    found: list[Method] = []
+    methods = [m for m in methods if m.denoised == method.denoised]
     if method.ours and method.kernel != ISOTROPIC:
         found += [m for m in methods if m.kernel == ISOTROPIC and m.bandwidth == method.bandwidth]
     if method.plugin["type"] != "path":
@@ -170,6 +172,8 @@ def _method(measured: Measured, method: Method) -> dict[str, Any]:
         "label": method.label,
         "plugin": method.plugin,
         "bandwidth": method.bandwidth,
+        "denoised": method.denoised,
+        "denoiser_seconds": _denoiser_seconds(cells),
         "radius": cells[0].record["radius"],
         "compile_seconds": measured.warm[method.name]["compile_seconds"],
         "setup_seconds": float(np.median([sum(s.get(n, 0.0) for n in SET_UP) for s in stages])),
@@ -178,9 +182,15 @@ def _method(measured: Measured, method: Method) -> dict[str, Any]:
     }
 
 
+def _denoiser_seconds(cells) -> float | None:
+    found = [cell.record.get("denoiser_seconds") for cell in cells]
+    found = [seconds for seconds in found if seconds is not None]
+    return float(np.median(found)) if found else None
+
+
 def _cost(measured: Measured, method: Method) -> dict[str, float] | None:
     """Time of a pass over that of the isotropic kernel of the same area."""
-    base = measured.runs.get(f"{ISOTROPIC}/default")
+    base = measured.runs.get(f"{ISOTROPIC}/default" + DENOISED * method.denoised)
     cells = measured.runs[method.name]
     if method.bandwidth != "default" or method.kernel == ISOTROPIC or not base:
         return None

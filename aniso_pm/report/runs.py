@@ -8,18 +8,25 @@ the pictures.
 ``aniso_pm`` renders passes of its own. Mitsuba's integrators are run again and again with other
 seeds and the pictures added up: with few samples at first, and with as many as fit into the time
 to the next budget later, so that their own costs of a call do not count against them.
+
+Denoised methods trace what denoising needs while the clock runs. The denoiser itself, which takes
+the same for all, is not on the clock.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from aniso_pm.denoising import denoise
+from aniso_pm.film import pixel_weights
 
+from .denoised import Calls, with_aovs
 from .methods import Method
 
 # Samples per pixel of one call of Mitsuba's integrators: each number compiles kernels of its own.
@@ -42,6 +49,7 @@ class Run:
     spp      samples per pixel in each picture.
     stages   seconds spent in each stage until the last picture.
     radius   bandwidth of the first pass, or None.
+    denoiser_seconds  of the denoiser for one picture; None where nothing was denoised.
     """
 
     images: np.ndarray
@@ -50,6 +58,7 @@ class Run:
     spp: list[int]
     stages: dict[str, float] = field(default_factory=dict)
     radius: float | None = None
+    denoiser_seconds: float | None = None
 
     @classmethod
     def without_pictures(cls, budgets: int, shape: tuple[int, ...]) -> Run:
@@ -68,6 +77,8 @@ class Stage:
     limits: dict[str, Any]  # max_depth and hide_emitters, which every method has to honour
     photons: int
     spp: int  # samples per pixel of a pass
+    # The scene and its camera with a box filter, which Mitsuba's integrators are denoised with.
+    boxed: Callable[[], tuple[Any, Any]] | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -80,12 +91,20 @@ class Stage:
         if not method.ours:
             return self.limits | method.plugin
         passes = {"photon_count": self.photons, "passes": 0}
-        bandwidth = {} if radius is None else {"initial_radius": radius}
-        return self.own | self.limits | method.plugin | passes | bandwidth
+        more = {} if radius is None else {"initial_radius": radius}
+        if method.denoised:
+            more["layers"] = "denoising"
+        return self.own | self.limits | method.plugin | passes | more
+
+    def seen_by(self, method: Method) -> tuple[Any, Any]:
+        """Scene and camera of a method."""
+        if method.denoised and not method.ours and self.boxed is not None:
+            return self.boxed()
+        return self.scene, self.sensor
 
 
 def joined(first: Run, second: Run) -> Run:
-    """Pictures of two runs with ascending budgets; stages and radius are those of the second."""
+    """Pictures of two runs with ascending budgets; all else is that of the second."""
     return Run(
         np.concatenate([first.images, second.images]),
         first.seconds + second.seconds,
@@ -93,6 +112,7 @@ def joined(first: Run, second: Run) -> Run:
         first.spp + second.spp,
         second.stages,
         second.radius,
+        second.denoiser_seconds,
     )
 
 
@@ -101,25 +121,43 @@ def run(stage: Stage, method: Method, radius: float | None, seed: int, budgets: 
 
     budgets  seconds, ascending.
     """
+    found, layers = recorded(stage, method, radius, seed, budgets)
+    if not method.denoised:
+        return found
+    took = []
+    for k, known in enumerate(layers):
+        if known is not None:
+            began = time.perf_counter()
+            found.images[k] = denoise(found.images[k], known)
+            took.append(time.perf_counter() - began)
+    found.denoiser_seconds = float(np.mean(took)) if took else None
+    return found
+
+
+def recorded(
+    stage: Stage, method: Method, radius: float | None, seed: int, budgets: list[float]
+) -> tuple[Run, list[dict[str, np.ndarray] | None]]:
+    """As :func:`run`, but pictures of denoised methods are left raw; what denoising needs is beside
+    each (None: no picture yet, or the method is not denoised)."""
     recorder = _Recorder(budgets, stage.shape)
-    parameters = stage.parameters(method, radius)
-    (_passes if method.ours else _calls)(stage, parameters, seed, recorder)
-    return recorder.run
+    (_passes if method.ours else _calls)(stage, method, radius, seed, recorder)
+    return recorder.run, recorder.layers
 
 
 class _Recorder:
-    """Keeps the last picture within each budget."""
+    """Keeps the last picture within each budget, and its layers."""
 
     def __init__(self, budgets: list[float], shape: tuple[int, ...]):
         self.budgets = budgets
         self.run = Run.without_pictures(len(budgets), shape)
+        self.layers: list[dict[str, np.ndarray] | None] = [None] * len(budgets)
 
-    def add(self, image, stages: dict[str, float], passes: int, spp: int) -> bool:
+    def add(self, image, stages: dict[str, float], passes: int, spp: int, layers=None) -> bool:
         """Note a finished picture (y, x, 3 or more). Returns whether time is up."""
         seconds = sum(stages.values())
         for k, budget in enumerate(self.budgets):
             if seconds <= budget:
-                self.run.images[k] = image[..., :3]
+                self.run.images[k], self.layers[k] = image[..., :3], layers
                 self.run.seconds[k], self.run.passes[k], self.run.spp[k] = seconds, passes, spp
         if seconds <= self.budgets[-1]:
             self.run.stages = stages
@@ -130,8 +168,9 @@ class _Enough(Exception):  # noqa: N818 (not an error)
     """Ends a rendering from its callback."""
 
 
-def _passes(stage: Stage, parameters, seed: int, recorder: _Recorder) -> None:
+def _passes(stage: Stage, method: Method, radius, seed: int, recorder: _Recorder) -> None:
     """Passes of an ``aniso_pm``."""
+    parameters = stage.parameters(method, radius)
     # The rule for time is the last resort: looking at pictures does not count here, but there.
     integrator = mi.load_dict(parameters | {"time": 4 * recorder.budgets[-1] + 60})
 
@@ -145,7 +184,8 @@ def _passes(stage: Stage, parameters, seed: int, recorder: _Recorder) -> None:
             prepare = time.perf_counter() - began - sum(stages.values())
         stages = {"prepare": prepare, **stages}
         recorder.run.radius = statistics["initial_radius"]
-        if recorder.add(np.array(image), stages, index + 1, statistics["spp"]):
+        layers = dict(integrator.layers) if method.denoised else None
+        if recorder.add(np.array(image), stages, index + 1, statistics["spp"], layers):
             raise _Enough
 
     integrator.callback = after_pass
@@ -157,10 +197,12 @@ def _passes(stage: Stage, parameters, seed: int, recorder: _Recorder) -> None:
         raise KeyboardInterrupt
 
 
-def _calls(stage: Stage, parameters, seed: int, recorder: _Recorder) -> None:
+def _calls(stage: Stage, method: Method, radius, seed: int, recorder: _Recorder) -> None:
     """Calls of one of Mitsuba's integrators, their pictures averaged."""
-    integrator = mi.load_dict(parameters)
-    sensor, budgets = stage.sensor, recorder.budgets
+    integrator, aovs = _mitsubas(stage, method)
+    scene, sensor = stage.seen_by(method)
+    beside = Calls(pixel_weights(stage.sensor.film()), aovs) if method.denoised else None
+    budgets = recorder.budgets
     total, spp, seconds, calls = 0.0, 0, 0.0, 0
     took: dict[int, float] = {}  # seconds of a call, by its samples
     done = False
@@ -168,13 +210,25 @@ def _calls(stage: Stage, parameters, seed: int, recorder: _Recorder) -> None:
         count = _samples(took, next(b for b in budgets if b >= seconds) - seconds)
         random = mi.sample_tea_32(seed, calls)[0]
         began = time.perf_counter()
-        integrator.render(stage.scene, sensor=sensor, seed=random, spp=count, develop=False)
+        integrator.render(scene, sensor=sensor, seed=random, spp=count, develop=False)
         dr.sync_thread()
         took[count] = time.perf_counter() - began
         taken = sensor.sampler().sample_count()  # samplers may round it up
-        total = total + taken * np.array(sensor.film().develop(), np.float64)[..., :3]
+        image = np.array(sensor.film().develop(), np.float64)
         spp, seconds, calls = spp + taken, seconds + took[count], calls + 1
-        done = recorder.add(total / spp, {"render": seconds}, calls, spp)
+        if beside is None:
+            total = total + taken * image[..., :3]
+            done = recorder.add(total / spp, {"render": seconds}, calls, spp)
+        else:
+            beside.add(image, taken)
+            stages = {"render": seconds}
+            done = recorder.add(beside.picture, stages, calls, spp, beside.layers)
+
+
+def _mitsubas(stage: Stage, method: Method) -> tuple[Any, bool]:
+    """One of Mitsuba's integrators, and whether it gives albedo and normal as well."""
+    parameters = stage.parameters(method, None)
+    return with_aovs(parameters) if method.denoised else (mi.load_dict(parameters), False)
 
 
 def _samples(took: dict[int, float], left: float) -> int:
@@ -195,18 +249,19 @@ def warm_up(stage: Stage, method: Method, radius: float | None, seed: int) -> di
     recording = dr.flag(dr.JitFlag.KernelHistory)
     dr.kernel_history_clear()
     dr.set_flag(dr.JitFlag.KernelHistory, True)
-    parameters = stage.parameters(method, radius)
     first = None
     try:
         if method.ours:
-            integrator = mi.load_dict(parameters | {"passes": _WARM_PASSES})
+            parameters = stage.parameters(method, radius) | {"passes": _WARM_PASSES}
+            integrator = mi.load_dict(parameters)
             spp = _WARM_PASSES * stage.spp
             integrator.render(stage.scene, sensor=stage.sensor, seed=seed, spp=spp)
             first = integrator.statistics["initial_radius"]
         else:
-            integrator = mi.load_dict(parameters)
+            integrator, _ = _mitsubas(stage, method)
+            scene, sensor = stage.seen_by(method)
             for count in CALLS:
-                integrator.render(stage.scene, sensor=stage.sensor, seed=seed, spp=count)
+                integrator.render(scene, sensor=sensor, seed=seed, spp=count)
         dr.sync_thread()
         kernels = [kernel for kernel in dr.kernel_history() if "backend_time" in kernel]
     finally:
