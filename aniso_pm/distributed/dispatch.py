@@ -445,9 +445,9 @@ class _Dispatch:
             for carrier in self.rendering:
                 self._drop(carrier)
             while self.carriers and time.monotonic() < until and self.client.status == "running":
-                self._unite()
-                if not self.homing and all(c.done for c in self.carriers.values()):
-                    self._go_home()
+                # One after the other: additions would wait for tasks that cannot be stopped.
+                if not self.homing:
+                    self.homing = next((c for c in self.carriers.values() if c.done), None)
                 yield from self._homecoming()
                 self._hear(0.1)
         except (Failed, OSError):
