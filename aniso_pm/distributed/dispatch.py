@@ -52,7 +52,8 @@ class Options:
 
     task_seconds  that a task should take: several passes, where they are short.
     task_limit    seconds after which a task counts as hung and is rendered elsewhere; None: ten
-                  times what it should take, and at least a minute.
+                  times what it should take and five minutes at least; three times and a minute
+                  where another worker has nothing to do.
     patience      seconds to wait for a first worker, or for another when all are gone.
     home_every    seconds after which sums come home, at the latest.
     mixed         may LLVM and CUDA workers render the same picture?
