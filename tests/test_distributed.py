@@ -86,8 +86,8 @@ def _mend():
 
 def test_workers_render_the_same_picture_as_one_process(client):
     seen = []
-    # A pilot chooses everything, pixel by pixel.
-    chosen = scene(map="auto", photon_count=0, initial_radius=0.0, layers="direct,caustic,indirect")
+    # A pilot chooses, pixel by pixel.
+    chosen = scene(photon_count=0, initial_radius=0.0, layers="direct,caustic,indirect")
     done = render(
         chosen, client, spp=36, seed=3, passes=12, progress=lambda *what: seen.append(what)
     )

@@ -85,10 +85,10 @@ def test_tasks_take_seconds_and_end_together():
 def test_a_task_has_ten_times_its_time_and_less_where_others_are_idle():
     pace = Pace(5.0, None)
     pace.seen(80.0, 10, first=False)
-    assert pace.limit(1) == 80 and pace.limit(10) == 800
-    assert pace.limit(1, idle=True) == 24
+    assert pace.limit(1) == 300 and pace.limit(10) == 800
+    assert pace.limit(1, idle=True) == 60 and pace.limit(10, idle=True) == 240
     pace.too_long()
-    assert pace.limit(1) == 160
+    assert pace.limit(1) == 600
     assert Pace(5.0, 33.0).limit(10) == 33
 
 

@@ -52,7 +52,8 @@ class Options:
 
     task_seconds  that a task should take: several passes, where they are short.
     task_limit    seconds after which a task counts as hung and is rendered elsewhere; None: ten
-                  times what it should take, and at least a minute.
+                  times what it should take and five minutes at least; three times and a minute
+                  where another worker has nothing to do.
     patience      seconds to wait for a first worker, or for another when all are gone.
     home_every    seconds after which sums come home, at the latest.
     mixed         may LLVM and CUDA workers render the same picture?
@@ -445,9 +446,9 @@ class _Dispatch:
             for carrier in self.rendering:
                 self._drop(carrier)
             while self.carriers and time.monotonic() < until and self.client.status == "running":
-                self._unite()
-                if not self.homing and all(c.done for c in self.carriers.values()):
-                    self._go_home()
+                # One after the other: additions would wait for tasks that cannot be stopped.
+                if not self.homing:
+                    self.homing = next((c for c in self.carriers.values() if c.done), None)
                 yield from self._homecoming()
                 self._hear(0.1)
         except (Failed, OSError):

@@ -9,9 +9,9 @@ from collections import deque
 # Tasks whose median tells how long a pass takes.
 _RECENT = 64
 # A task that takes so many times as long as expected is given up, but none before so many seconds.
-_TOO_LONG, _AT_LEAST = 10.0, 60.0
+_TOO_LONG, _AT_LEAST = 10.0, 300.0
 # The same where another worker has nothing to do.
-_TOO_LONG_IDLE, _AT_LEAST_IDLE = 3.0, 10.0
+_TOO_LONG_IDLE, _AT_LEAST_IDLE = 3.0, 60.0
 # Seconds for a task of which nothing is known: it compiles kernels, too.
 _UNKNOWN = 600.0
 
