@@ -19,6 +19,8 @@ from passes import SMALL
 from rooms import room_with_ball
 from test_parcel import spread  # noqa: F401  (a fixture)
 
+# One process: one cluster.
+pytestmark = pytest.mark.xdist_group("cluster")
 SIZE = 16
 
 

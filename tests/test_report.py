@@ -30,6 +30,9 @@ from aniso_pm.settings import Settings
 from conftest import tick
 from rooms import room, room_with_ball, room_with_plate
 
+# One process: the report that most tests look at is made once.
+pytestmark = pytest.mark.xdist_group("report")
+
 SCENE = """<scene version="3.0.0">
   <default name="width" value="32"/>
   <integrator type="aniso_pm"><integer name="max_depth" value="6"/></integrator>
@@ -151,6 +154,7 @@ def test_page_needs_no_other_file_and_shows_every_figure(done):
     assert text.count("data:image/svg+xml") == len(svgs)
 
 
+@pytest.mark.slow
 def test_denoised_rows_stand_beside_raw_ones(scene, tmp_path, monkeypatch, ticking):
     monkeypatch.setattr(runs, "CALLS", (1,))
     names = ("lobe/default", "path")
