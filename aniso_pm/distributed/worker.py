@@ -162,9 +162,11 @@ class _Rendering:
         for index in numbers(ranges):
             self.run.render_pass(index)
         batch = self.run.batch()
-        if not self.variance:
-            batch = replace(batch, arrays={"first": batch.arrays["first"]})
-        return batch, self.run.stopping.compiling - compiled
+        names = batch.arrays if self.variance else ["first"]
+        # Copies: these arrays lie in Dr.Jit's memory. Dask's thread would give it back, holding
+        # Python's lock and waiting for Dr.Jit's, while the thread that renders does the reverse.
+        arrays = {name: np.array(batch.arrays[name], copy=True) for name in names}
+        return replace(batch, arrays=arrays), self.run.stopping.compiling - compiled
 
 
 def _joined(job: Job) -> _Rendering:
