@@ -39,6 +39,8 @@ class Crew:
     patience  seconds to wait for a first worker, or another one when all are gone.
     keep      workers that the client's own cluster is to have; 0: it has none of its own.
     warn      called with a sentence for each worker that is not used.
+
+    known     addresses of all who are there.
     """
 
     def __init__(
@@ -54,7 +56,7 @@ class Crew:
         self.good: dict[str, dict[str, Any]] = {}
         self.refused: dict[str, str] = {}
         self._joining: dict[str, _Candidate] = {}
-        self._known: set[str] = set()
+        self.known: set[str] = set()
         self._slow: set[str] = set()
         self._looked = 0.0
         self._some = self._complete = time.monotonic()  # when there was last anybody, everybody
@@ -67,12 +69,12 @@ class Crew:
             return
         self._looked = now
         self._look()
-        if len(self._known) >= self._keep:
+        if len(self.known) >= self._keep:
             self._complete = now
         elif now - self._complete > _MISSED:  # its nanny has not brought it back
             self._complete = now
             self.client.cluster.scale(self._keep)
-        for address in self._known - {*self.good, *self.refused, *self._joining}:
+        for address in self.known - {*self.good, *self.refused, *self._joining}:
             self._ask(address)
         self._hear()
         if self.good or self._joining:
@@ -99,8 +101,9 @@ class Crew:
 
     @property
     def allowed(self) -> list[str] | None:
-        """Who may be given tasks; None where that is everybody."""
-        return None if self._known <= self.good.keys() else sorted(self.good)
+        """Who may be given tasks; None where that is everybody. Who has not joined yet does so with
+        its first task."""
+        return sorted(self.known - self.refused.keys()) if self.refused else None
 
     def restart(self, address: str) -> None:
         """Let its nanny end a worker and start another, without waiting for that."""
@@ -119,11 +122,11 @@ class Crew:
 
     def _look(self) -> None:
         try:
-            self._known = set(self.client.scheduler_info(n_workers=-1)["workers"])
+            self.known = set(self.client.scheduler_info(n_workers=-1)["workers"])
         except (OSError, TimeoutError) as error:
             raise Failed(gone(self.client)) from error
         for group in (self.good, self.refused, self._joining):
-            for address in [a for a in group if a not in self._known]:
+            for address in [a for a in group if a not in self.known]:
                 del group[address]
 
     def _ask(self, address: str) -> None:

@@ -78,7 +78,7 @@ class Options:
 @dataclass
 class _Carrier:
     """What stands for passes. due: when to give up; places: workers that it, or its parts, are on,
-    as far as known."""
+    as far as known; bound: sets of workers outside of which it, or its parts, may not be."""
 
     key: str
     future: Any
@@ -86,6 +86,7 @@ class _Carrier:
     due: float
     renders: bool
     places: frozenset[str] = frozenset()
+    bound: frozenset[frozenset[str]] = frozenset()
     done: bool = False
     started: float | None = None
     fetching: bool = False
@@ -175,6 +176,7 @@ class _Dispatch:
         while not self.ledger.finished:
             self._check_scheduler()
             self.crew.update()
+            self._give_up_stranded()
             self._decide()
             self._hand_out()
             self._hear(0.5)
@@ -233,7 +235,7 @@ class _Dispatch:
             )
             # Behind others it has to wait.
             due = time.monotonic() + 3 * _AHEAD * self.pace.limit(count)
-            self._watch(_Carrier(key, future, count, due, True))
+            self._watch(_Carrier(key, future, count, due, True, bound=self._bound()))
 
     def _seconds_left(self, workers: int) -> float:
         """For a task that begins when what was handed out is done."""
@@ -304,6 +306,17 @@ class _Dispatch:
                 for address in carrier.places:
                     self.crew.refuse(address, f"{type(error).__name__}: {one_line(error)}")
         self._lost(carrier)
+
+    def _bound(self) -> frozenset[frozenset[str]]:
+        allowed = self.crew.allowed
+        return frozenset() if allowed is None else frozenset([frozenset(allowed)])
+
+    def _give_up_stranded(self) -> None:
+        """What nobody is left for that may render it, Dask would keep for ever."""
+        for carrier in list(self.carriers.values()):
+            if carrier.future.status != "finished":
+                if any(not workers & self.crew.known for workers in carrier.bound):
+                    self._lost(carrier)
 
     def _give_up_late(self) -> None:
         """Carriers that take too long are lost; a worker that hangs is not used any more."""
@@ -378,7 +391,8 @@ class _Dispatch:
             del self.carriers[carrier.key]
         due = time.monotonic() + 3 * self.pace.limit(1)
         places = frozenset().union(*(carrier.places for carrier in several))
-        self._watch(_Carrier(future.key, future, passes, due, False, places))
+        bound = self._bound().union(*(carrier.bound for carrier in several))
+        self._watch(_Carrier(future.key, future, passes, due, False, places, bound))
         return self.carriers[future.key]
 
     def _addition(self, futures: list):

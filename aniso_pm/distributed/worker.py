@@ -162,10 +162,11 @@ class _Rendering:
         for index in numbers(ranges):
             self.run.render_pass(index)
         batch = self.run.batch()
-        if not self.variance:
-            kept = {k: v for k, v in batch.arrays.items() if k not in ("square", "cross")}
-            batch = replace(batch, arrays=kept)
-        return batch, self.run.stopping.compiling - compiled
+        names = [n for n in batch.arrays if self.variance or n not in ("square", "cross")]
+        # Copies: these arrays lie in Dr.Jit's memory. Dask's thread would give it back, holding
+        # Python's lock and waiting for Dr.Jit's, while the thread that renders does the reverse.
+        arrays = {name: np.array(batch.arrays[name], copy=True) for name in names}
+        return replace(batch, arrays=arrays), self.run.stopping.compiling - compiled
 
 
 def _joined(job: Job) -> _Rendering:
