@@ -89,40 +89,50 @@ def passes_in(path):
 
 
 def test_kills_of_workers_and_of_the_client_leave_the_same_picture(scene, tmp_path):
-    """Five of workers, two of clients, at random times."""
+    """Five of workers, two of clients, at random times; then as many passes as it has come to."""
     chance = random.Random(7)
-    passes = 400
-    arguments = ["render", scene, "--passes", passes, "--spp", passes, "--quiet"]
-    whole = process(*arguments, "-o", "whole.exr", cwd=tmp_path)
-    assert whole.wait(timeout=900) == 0
-    arguments += ["-o", "a.exr", "--resume", "--workers", 2, "--save-every", 1]
-    arguments += ["--task-seconds", 0.5]
+
+    def render(passes, out, *more):
+        arguments = ["render", scene, "-o", out, "--passes", passes, "--spp", passes, "--quiet"]
+        return process(*arguments, *more, cwd=tmp_path)
+
+    def begin(passes=10**6):
+        options = ["--workers", 2, "--save-every", 1, "--task-seconds", 0.5]
+        return render(passes, "a.exr", "--resume", *options)
+
+    state = tmp_path / "a.state"
     kills, log = {"worker": 5, "client": 2}, []
-    program = process(*arguments, cwd=tmp_path)
+    program = begin()
     while kills["worker"] or kills["client"]:
-        begun = passes_in(tmp_path / "a.state")
-        # Something has to be there to be lost.
-        while passes_in(tmp_path / "a.state") <= begun and program.poll() is None:
+        begun = passes_in(state)
+        while passes_in(state) <= begun:  # something has to be there to be lost
+            assert program.poll() is None, program.communicate()
             time.sleep(0.2)
         time.sleep(chance.uniform(0, 1.5))
-        assert program.poll() is None, program.communicate()
         whom = chance.choice([name for name, left in kills.items() if left])
         kills[whom] -= 1
-        log.append((whom, passes_in(tmp_path / "a.state")))
+        log.append((whom, passes_in(state)))
         if whom == "worker":
-            there = workers_of(program)
-            if there:
-                chance.choice(there).kill()
+            chance.choice(workers_of(program)).kill()
         else:
             orphans = psutil.Process(program.pid).children(recursive=True)
             program.kill()
             program.communicate()
             psutil.wait_procs(orphans, timeout=60)
-            program = process(*arguments, cwd=tmp_path)
-    print("killed, with so many passes saved:", log)
+            program = begin()
+    begun = passes_in(state)
+    while passes_in(state) <= begun:
+        assert program.poll() is None, program.communicate()
+        time.sleep(0.2)
+    program.send_signal(signal.SIGINT)
+    assert program.wait(timeout=600) == 130
+    passes = State.load(state).passes[-1][1]
+    print("killed, with so many passes saved:", log, "of", passes)
+    program = begin(passes)
     _, stderr = program.communicate(timeout=900)
     assert program.returncode == 0, stderr
-    assert State.load(tmp_path / "a.state").passes == [[0, passes]]
+    assert State.load(state).passes == [[0, passes]]
+    assert render(passes, "whole.exr").wait(timeout=900) == 0
     assert_same_picture(tmp_path / "whole.exr", tmp_path / "a.exr")
 
 
