@@ -33,17 +33,8 @@ from . import summed
 from .eye import GatherPoints
 from .kernel import PlaneKernel, disc, guarded_axes
 from .lobe_path import LobeOnPath
-from .photons import (
-    NORMAL_COS,
-    PhotonMap,
-    faces,
-    is_caustic,
-    one_sheet,
-    photon_direction,
-    photon_flux,
-    segments,
-    smooth_between,
-)
+from .photon_word import NORMAL_COS, faces, is_caustic, one_sheet, segments, smooth_between
+from .photons import PhotonMap, photon_direction, photon_flux
 from .receivers import gathered_part
 from .spectra import channel_mean
 

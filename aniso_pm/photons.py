@@ -37,6 +37,7 @@ import numpy as np
 from . import index as spatial
 from .aim import Aim
 from .emission import Emission, only_photons_see
+from .photon_word import SEGMENTS_MAX, decode, encode, encode_normal, is_caustic
 from .rays import largest_coordinate, spawn_ray
 from .receivers import gathered_part, read_bent, read_receiver
 from .spectra import channel_mean
@@ -115,12 +116,6 @@ class Origins:
 
 
 EMPTY = PhotonMap(0, 0, 0, None, None, None, None)
-# Cosine between normals from which two points may lie on the same surface.
-NORMAL_COS = 0.75
-# Share of their distance by which they may miss a smooth surface through both.
-BEND = 0.05
-# Segments that the word can tell apart: this number stands for itself and more.
-SEGMENTS_MAX = 127
 
 
 def build_map(
@@ -223,7 +218,7 @@ def read_flux(column, slot, active):
 
 def photon_direction(photons: PhotonMap, slot, active):
     """Unit vector from the photon in a slot to where its light came from."""
-    return _decode(dr.gather(mi.UInt32, photons.direction, slot, active), 16)
+    return decode(dr.gather(mi.UInt32, photons.direction, slot, active), 16)
 
 
 def _flux_width() -> int:
@@ -238,69 +233,6 @@ def flux_bytes() -> int:
 def _packet():
     """Array type of one photon's flux: a power of two of channels is gathered at once."""
     return mi.Vector1f if _flux_width() == 1 else mi.Vector4f
-
-
-def encode_normal(n):
-    """Unit vector → 24 bits (octahedral, 12 bits a coordinate: within 0.07 degrees)."""
-    return _encode(n, 12)
-
-
-def decode_normal(word):
-    """Inverse of ``encode_normal``; higher bits of the word are ignored."""
-    return _decode(word, 12)
-
-
-def faces(word, n, least=NORMAL_COS):
-    """Is the cosine between the photon's normal and n above ``least`` (> 0)?"""
-    v = _octahedral(word, 12)
-    cosine = dr.dot(v, n)
-    return (cosine > 0) & (dr.square(cosine) > least**2 * dr.squared_norm(v))
-
-
-def one_sheet(word, n, d, rounding):
-    """May a surface go smoothly from a point to the photon at the offset d from it? On quadrics
-    (n + n')·d = 0, for the photon's normal n'; between parallel sheets at the distance h it is 2h.
-    rounding: of offsets, world units."""
-    return smooth_between(n, _decode(word, 12), d, rounding)
-
-
-def smooth_between(n, other, d, rounding):
-    """The same for a normal that is known."""
-    return dr.abs(dr.dot(n + other, d)) <= BEND * dr.norm(d) + rounding
-
-
-def _encode(v, bits):
-    v = v / (dr.abs(v.x) + dr.abs(v.y) + dr.abs(v.z))
-    fold_x = dr.mulsign(1 - dr.abs(v.y), v.x)
-    fold_y = dr.mulsign(1 - dr.abs(v.x), v.y)
-    x, y = dr.select(v.z < 0, fold_x, v.x), dr.select(v.z < 0, fold_y, v.y)
-    top = 2**bits - 1
-    quantise = lambda c: mi.UInt32(dr.clip((0.5 * c + 0.5) * top + 0.5, 0, top))  # noqa: E731
-    return quantise(x) | (quantise(y) << bits)
-
-
-def _decode(word, bits):
-    return dr.normalize(_octahedral(word, bits))
-
-
-def _octahedral(word, bits):
-    """The decoded direction, not of unit length."""
-    top = 2**bits - 1
-    x = mi.Float(word & top) * (2 / top) - 1
-    y = mi.Float((word >> bits) & top) * (2 / top) - 1
-    z = 1 - dr.abs(x) - dr.abs(y)
-    fold = dr.maximum(-z, 0)
-    return mi.Vector3f(x - dr.mulsign(fold, x), y - dr.mulsign(fold, y), z)
-
-
-def segments(word):
-    """Number of path segments from the light to the photon (SEGMENTS_MAX: that many and more)."""
-    return (word >> 24) & SEGMENTS_MAX
-
-
-def is_caustic(word):
-    """Did the photon come over walked parts of BSDFs only? (Maps that mark caustics.)"""
-    return (word >> 31) != 0
 
 
 @dataclass
@@ -381,7 +313,7 @@ def light_paths(scene, source, sampler, options, photons, stored, rejected, room
         dr.scatter(photons.word, word, slot, active)
         dr.scatter(photons.flux, flux, slot, active)
         if options.general:
-            dr.scatter(photons.direction, _encode(direction, 16), slot, active)
+            dr.scatter(photons.direction, encode(direction, 16), slot, active)
         if options.remember:
             dr.scatter(photons.path, path, slot, active)
 

@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import density, emission, eye, layers, photons, summed
+from . import density, emission, eye, layers, photon_word, photons, summed
 from .aim import Aim
 from .footprint import TRIED, Footprint
 from .needs import Needs, read_scene
@@ -162,10 +162,10 @@ class Prepared:
     def gather_depth(self) -> int:
         """The limit that ``density.estimate`` has to test photons against: none if there is no
         limit, or if all gather points lie at the first vertex and the map keeps the limit. Paths of
-        more than ``photons.SEGMENTS_MAX`` segments are not told apart."""
+        more than ``photon_word.SEGMENTS_MAX`` segments are not told apart."""
         limit = self.settings.max_depth
         tested = self.deep or self.use != "global"
-        return limit if tested and 0 < limit <= photons.SEGMENTS_MAX else 0
+        return limit if tested and 0 < limit <= photon_word.SEGMENTS_MAX else 0
 
     @property
     def kernel_options(self) -> density.KernelOptions:

@@ -27,7 +27,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import photons
+from . import photon_word, photons
 from .eye import take
 from .index import LEAF, Ellipses
 
@@ -99,11 +99,11 @@ def _leaves(map_: photons.PhotonMap) -> _Node:
         slot = dr.minimum(first + k, count - 1)
         point = dr.gather(mi.Vector4f, index.points, slot)
         word = dr.reinterpret_array(mi.UInt32, point.w)
-        normal = photons.decode_normal(word)
+        normal = photon_word.decode_normal(word)
         # The last photon, again and again without flux, fills up what does not exist.
         flux = dr.select(exists, photons.photon_flux(map_, slot, True), 0)
         x, y, z = (mi.Spectrum(c) for c in (point.x, point.y, point.z))
-        steps, caustic = photons.segments(word), photons.is_caustic(word)
+        steps, caustic = photon_word.segments(word), photon_word.is_caustic(word)
         return _Node(flux, x, y, z, normal, normal, steps, caustic)
 
     return reduce(_joined, map(photon, range(LEAF)))
@@ -141,7 +141,7 @@ def _word(node: _Node):
     # The box of the normals of photons that face all ways has its middle nowhere.
     middle = node.low + node.high
     middle = dr.select(dr.squared_norm(middle) > 0, middle, mi.Normal3f(0, 0, 1))
-    word = photons.encode_normal(middle) | (node.segments << 24)
+    word = photon_word.encode_normal(middle) | (node.segments << 24)
     return word | dr.select(node.caustic, mi.UInt32(1 << 31), mi.UInt32(0))
 
 

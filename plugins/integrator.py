@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm import progressive
+from aniso_pm.controls import Batch, Controls
 from aniso_pm.film import pixel_weights as film_weights
 from aniso_pm.layered import develop
 from aniso_pm.pilot import USUAL, automatic_radius
@@ -255,7 +256,7 @@ class AnisoPhotonMapper:
         self.progress: Callable[[float, int | None, str], None] | None = None
         self.callback: Callable[[int, Any, dict], None] | None = None
         self.checkpoint: Checkpoint | None = None
-        self.elsewhere: Callable[[progressive.Run], Iterator[progressive.Batch]] | None = None
+        self.elsewhere: Callable[[progressive.Run], Iterator[Batch]] | None = None
         self.first_pass = 0
         self._last_map: tuple | None = None
         self._exposed: dict[str, Any] = {}
@@ -285,7 +286,7 @@ class AnisoPhotonMapper:
         with dr.suspend_grad():
             prepared = prepare(scene, self.settings, self.hide_emitters)
             so_far = partial(self._so_far, film_weights(sensor.film()))
-            controls = progressive.Controls(
+            controls = Controls(
                 self.first_pass,
                 self.progress,
                 self.callback,

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import emission, photons
+from aniso_pm import emission, photon_word, photons
 
 ALBEDO = 0.5
 UNLIMITED = 0xFFFFFFFE
@@ -67,7 +67,7 @@ def test_max_depth_cuts_the_series(depth):
     # Without Russian roulette every path deposits exactly this.
     assert total_flux(map_) == pytest.approx(expected, rel=1e-4)
     words = dr.gather(mi.Vector4f, map_.index.points, dr.arange(mi.UInt32, map_.stored)).w
-    segments = photons.segments(dr.reinterpret_array(mi.UInt32, words)).numpy()
+    segments = photon_word.segments(dr.reinterpret_array(mi.UInt32, words)).numpy()
     assert (segments.min(), segments.max()) == (2, depth)
 
 
@@ -165,7 +165,7 @@ def test_normals_survive_their_encoding():
     n /= np.linalg.norm(n, axis=1)[:, None]
     n[:6] = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]
     v = mi.Vector3f(np.ascontiguousarray(n.T.astype(np.float32)))
-    back = photons.decode_normal(photons.encode_normal(v) | (77 << 24)).numpy().T
+    back = photon_word.decode_normal(photon_word.encode_normal(v) | (77 << 24)).numpy().T
     assert (back * n).sum(1).min() > np.cos(np.radians(0.07))  # 12 bits a coordinate
 
 
@@ -174,7 +174,7 @@ def test_directions_survive_packing():
     rng = np.random.default_rng(3)
     v = rng.normal(size=(3, 10_000))
     v /= np.linalg.norm(v, axis=0)
-    back = photons._decode(photons._encode(mi.Vector3f(v.astype(np.float32)), 16), 16).numpy()
+    back = photon_word.decode(photon_word.encode(mi.Vector3f(v.astype(np.float32)), 16), 16).numpy()
     assert np.linalg.norm(back - v, axis=0).max() < 1e-4
 
 
@@ -199,7 +199,7 @@ def test_faces_is_the_cosine_of_the_decoded_normal():
     a, b = (rng.normal(size=(3, 20000)).astype(np.float32) for _ in range(2))
     b[:, ::2] = a[:, ::2] + 0.8 * b[:, ::2]  # half of them near the threshold
     a, b = (mi.Normal3f(v / np.linalg.norm(v, axis=0)) for v in (a, b))
-    word = photons.encode_normal(a) | (5 << 24) | (1 << 31)
-    cosine = np.sum(np.array(photons.decode_normal(word)) * np.array(b), axis=0)
+    word = photon_word.encode_normal(a) | (5 << 24) | (1 << 31)
+    cosine = np.sum(np.array(photon_word.decode_normal(word)) * np.array(b), axis=0)
     clear = np.abs(cosine - 0.75) > 1e-5
-    np.testing.assert_array_equal(photons.faces(word, b).numpy()[clear], (cosine > 0.75)[clear])
+    np.testing.assert_array_equal(photon_word.faces(word, b).numpy()[clear], (cosine > 0.75)[clear])

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import density, eye, kernel, photons, summed
+from aniso_pm import density, eye, kernel, photon_word, photons, summed
 from aniso_pm import index as spatial
 
 COUNT, POINTS = 40_000, 200
@@ -25,7 +25,7 @@ def scattered(rng, colours="any", normals=None):
     if normals is None:
         normals = np.tile([0.0, 0, 1], (COUNT, 1))
     segments = rng.integers(2, 6, COUNT)
-    word = photons.encode_normal(vectors(normals)) | (mi.UInt32(segments) << 24)
+    word = photon_word.encode_normal(vectors(normals)) | (mi.UInt32(segments) << 24)
     word |= mi.UInt32((position[:, 0] > 0.5).astype(np.uint32)) << 31
     index, order = spatial.build(mi.Point3f(vectors(position)), word)
     flux = rng.random((COUNT, 3)) ** 3

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import pilot, survey
+from aniso_pm import pilot, plan
 from aniso_pm.prepared import prepare
 from aniso_pm.settings import Settings
 from aniso_pm.tiles import SAMPLES, Tiles
@@ -50,8 +50,8 @@ def test_kernels_are_wide_where_light_is_smooth_and_narrow_at_an_edge():
     count = tiles.across * tiles.down
     change = np.zeros((tiles.down, tiles.across))
     change[:, 20:] = 0.04
-    widths = survey._widths(tiles, np.full(count, 2e5), change.ravel(), 16 * 1e5)
-    assert (widths[:, :14] == survey._WIDEST).all()
+    widths = plan.kernel_widths(tiles, np.full(count, 2e5), change.ravel(), 16 * 1e5)
+    assert (widths[:, :14] == plan._WIDEST).all()
     smooth, edge = widths[:, :14].mean(), widths[:, 25:]
     assert edge.mean() < 0.6 * smooth
     # bias² = 2/3 of the variance at the minimum, bias² + half a standard error being given
@@ -79,7 +79,7 @@ def test_variances_are_those_of_the_samples(variant_llvm_rgb):
     alone = random.normal(0, np.sqrt(0.5 / k), (2, count, 2))
     a, b = (gather + shared[m] + alone[m] for m in (0, 1))
     weight = np.ones(count)
-    assert survey._within(a, b, weight).mean() == pytest.approx(0.3, rel=0.03)
-    v_shared, v_alone = survey._of_photons(a - b, weight)
+    assert plan.within(a, b, weight).mean() == pytest.approx(0.3, rel=0.03)
+    v_shared, v_alone = plan.of_photons(a - b, weight)
     assert v_shared.mean() == pytest.approx(0.2, rel=0.03)
     assert v_alone.mean() == pytest.approx(0.5, rel=0.03)

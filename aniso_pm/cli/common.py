@@ -32,6 +32,23 @@ Parameter = Annotated[
     list[str] | None,
     typer.Option("-p", metavar="NAME=VALUE", help="Parameter of the integrator."),
 ]
+Samples = Annotated[
+    int | None, typer.Option(min=1, max=2**31 - 1, help="Samples per pixel in all.")
+]
+Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Random seed.")]
+Passes = Annotated[int | None, typer.Option(min=1, max=10**7, help="Stop after so many passes.")]
+Seconds = Annotated[
+    float | None, typer.Option("--time", min=0.001, help="Stop after so many seconds.")
+]
+TargetError = Annotated[
+    float | None,
+    typer.Option(min=1e-6, help="Stop at this relative standard error (0.02: 2 %)."),
+]
+Camera = Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")]
+Layers = Annotated[
+    str | None,
+    typer.Option("--layers", metavar="NAMES", help="Layers to write as well: direct,albedo,…"),
+]
 
 
 class InterruptError(Exception):

@@ -16,11 +16,18 @@ from aniso_pm.progress import bar
 
 from .common import (
     INTERRUPTED,
+    Camera,
     Define,
     Integrator,
     InterruptError,
+    Layers,
     Parameter,
+    Passes,
+    Samples,
     SceneFile,
+    Seconds,
+    Seed,
+    TargetError,
     Variant,
     load,
     mitsuba_log,
@@ -48,20 +55,11 @@ def render(
     out: Annotated[Path, typer.Option("--output", "-o", help="Picture to write (.exr).")],
     variant: Variant = "llvm_ad_rgb",
     define: Define = None,
-    spp: Annotated[
-        int | None, typer.Option(min=1, max=2**31 - 1, help="Samples per pixel in all.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Random seed.")] = 0,
-    passes: Annotated[
-        int | None, typer.Option(min=1, max=10**7, help="Stop after so many passes.")
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option("--time", min=0.001, help="Stop after so many seconds.")
-    ] = None,
-    target_error: Annotated[
-        float | None,
-        typer.Option(min=1e-6, help="Stop at this relative standard error (0.02: 2 %)."),
-    ] = None,
+    spp: Samples = None,
+    seed: Seed = 0,
+    passes: Passes = None,
+    seconds: Seconds = None,
+    target_error: TargetError = None,
     first_pass: Annotated[
         int, typer.Option(min=0, max=10**7, help="Number of the first pass.")
     ] = 0,
@@ -74,7 +72,7 @@ def render(
     save_every: Annotated[
         float, typer.Option(min=0, help="Seconds between savings of picture and state.")
     ] = 30.0,
-    sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
+    sensor: Camera = 0,
     workers: Workers = None,
     scheduler: Scheduler = None,
     scheduler_file: SchedulerFile = None,
@@ -86,10 +84,7 @@ def render(
     tls_key: TlsKey = None,
     integrator_name: Integrator = None,
     parameter: Parameter = None,
-    layer_names: Annotated[
-        str | None,
-        typer.Option("--layers", metavar="NAMES", help="Layers to write as well: direct,albedo,…"),
-    ] = None,
+    layer_names: Layers = None,
     denoise: Denoise = False,
     png: Png = False,
     exposure: Exposure = 0.0,

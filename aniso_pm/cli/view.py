@@ -11,9 +11,16 @@ from aniso_pm.errors import InputError, one_line
 
 from .common import (
     INTERRUPTED,
+    Camera,
     Define,
     Integrator,
+    Layers,
     Parameter,
+    Passes,
+    Samples,
+    Seconds,
+    Seed,
+    TargetError,
     Variant,
     load,
     mitsuba_log,
@@ -38,25 +45,15 @@ def view(
     ] = None,
     variant: Variant = "llvm_ad_rgb",
     define: Define = None,
-    spp: Annotated[
-        int | None, typer.Option(min=1, max=2**31 - 1, help="Samples per pixel, as in render.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Random seed.")] = 0,
-    passes: Annotated[
-        int | None, typer.Option(min=1, max=10**7, help="Stop after so many passes.")
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option("--time", min=0.001, help="Stop after so many seconds.")
-    ] = None,
-    target_error: Annotated[
-        float | None, typer.Option(min=1e-6, help="Stop at this relative standard error.")
-    ] = None,
-    sensor: Annotated[int, typer.Option("--sensor", "-s", min=0, help="Which camera.")] = 0,
+    spp: Samples = None,
+    seed: Seed = 0,
+    passes: Passes = None,
+    seconds: Seconds = None,
+    target_error: TargetError = None,
+    sensor: Camera = 0,
     integrator_name: Integrator = None,
     parameter: Parameter = None,
-    layer_names: Annotated[
-        str | None, typer.Option("--layers", metavar="NAMES", help="Layers to show as well.")
-    ] = None,
+    layer_names: Layers = None,
     host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
     allow_others: Annotated[
         bool, typer.Option("--allow-others", help="Let --host be reachable from other machines.")

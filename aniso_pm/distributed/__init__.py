@@ -20,7 +20,8 @@ from aniso_pm.errors import Failed, InputError, one_line
 from aniso_pm.state import Checkpoint
 
 from .cluster import require
-from .dispatch import Elsewhere, Options
+from .dispatch import Elsewhere
+from .options import Options
 from .parcel import Parcel
 
 __all__ = ["Elsewhere", "Options", "Parcel", "Result", "render"]

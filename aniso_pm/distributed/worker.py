@@ -68,7 +68,7 @@ def join(job: Job) -> dict[str, Any]:
 
 
 def render(job: Job, passes: list[list[int]], task: str) -> dict[str, Any]:
-    """Render passes (half-open ranges). Returns them with their sums: see ``progressive.Batch``.
+    """Render passes (half-open ranges). Returns them with their sums: see ``controls.Batch``.
     Tells the client when it starts and ends."""
     worker = _Worker()
     with _rendering:
@@ -120,6 +120,7 @@ class _Rendering:
         import drjit as dr
         import mitsuba as mi
         from aniso_pm import progressive
+        from aniso_pm.controls import Controls
         from aniso_pm.digest import camera_entries, differences, scene_entries
         from aniso_pm.prepared import prepare
         from aniso_pm.settings import Settings
@@ -145,7 +146,7 @@ class _Rendering:
             settings = settings.with_(max_memory=limit)
         prepared = prepare(world, settings, job.render["hide_emitters"])
         settled = grown(job.render["settled"])
-        controls = progressive.Controls(job.render["first_pass"], settled=settled)
+        controls = Controls(job.render["first_pass"], settled=settled)
         seed, spp = job.render["seed"], job.render["spp"]
         self.run = progressive.Run(prepared, sensor, seed, spp, controls, {})
         self.run.start()

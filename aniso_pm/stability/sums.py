@@ -7,7 +7,7 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from aniso_pm import density, kernel, photons
+from aniso_pm import density, kernel, photon_word, photons
 from aniso_pm import index as spatial
 from aniso_pm.eye import GatherPoints
 
@@ -20,7 +20,7 @@ SUMS = 1e-4
 def photon_map(position, power, emitted=1000) -> photons.PhotonMap:
     """A map of photons at ``position`` (n, 3) of ``power`` (n) on surfaces that face +z."""
     count = len(position)
-    word = photons.encode_normal(mi.Normal3f(0, 0, 1)) | (2 << 24)
+    word = photon_word.encode_normal(mi.Normal3f(0, 0, 1)) | (2 << 24)
     index, order = spatial.build(_points(position), dr.full(mi.UInt32, int(word[0]), count))
     wide = np.array(power, np.float32)[order.numpy()]
     width = 1 if dr.size_v(mi.Spectrum) == 1 else 4

@@ -1,0 +1,73 @@
+"""What a caller may want of a rendering in passes, and what is left of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .pilot import Settled
+from .prepared import Prepared
+from .state import Checkpoint
+
+if TYPE_CHECKING:
+    from .progressive import Run
+
+
+@dataclass
+class Controls:
+    """What a caller may want besides the picture.
+
+    first_pass  number of the first pass.
+    progress    called as progress(done, total, text) after every wavefront: passes, which may be
+                fractions; total is None where nobody knows.
+    callback    called as callback(pass_index, image, statistics) after every pass: the picture so
+                far as a tensor, and the statistics so far.
+    checkpoint  where to keep the state.
+    so_far      called as so_far(variance, layers, passes), as in ``Rendered``, before somebody else
+                looks at the picture so far.
+    settled     what a pilot has chosen, on another machine; None: one will choose here.
+    elsewhere   who renders the passes, if not this process: called with the ``Run``, gives them as
+                ``Batch``es. progress and callback are then called after each of those.
+    """
+
+    first_pass: int = 0
+    progress: Callable[[float, int | None, str], None] | None = None
+    callback: Callable[[int, Any, dict], None] | None = None
+    checkpoint: Checkpoint | None = None
+    so_far: Callable[[Any, Any, int], None] | None = None
+    settled: Settled | None = None
+    elsewhere: Callable[[Run], Iterator[Batch]] | None = None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Passes that were rendered together.
+
+    passes   half-open ranges of their numbers (see ``state.State``).
+    arrays   ``Sums.arrays()`` of them, and the sums of their layers.
+    counts   what they counted.
+    seconds  that each stage took.
+    """
+
+    passes: list[list[int]]
+    arrays: dict[str, np.ndarray]
+    counts: dict[str, int]
+    seconds: dict[str, float]
+
+
+@dataclass
+class Rendered:
+    """What is left of a rendering beside the film: the scene with what was chosen for it, map and
+    radius of the last pass (None if no pass was rendered), variance of the picture (None with one
+    pass), sums of the layers that were asked for (see ``layered``; None: none were) over so many
+    passes."""
+
+    scene: Prepared
+    map: Any
+    radius: float | None
+    variance: np.ndarray | None
+    layers: dict[str, np.ndarray] | None
+    passes: int
