@@ -109,13 +109,22 @@ OBJECTS = {
     },
     "asgconductor": {"type": "asgconductor", "material": "Al", "alpha_u": 0.05, "alpha_v": 0.3},
 }
+OTHERS = sorted(OBJECTS.keys() - {"roughplastic", "mask", "bumped diffuse"})
 
 
-@pytest.mark.parametrize("name", OBJECTS)
-@pytest.mark.parametrize("instanced", [False, True])
+# One of each kind for every run of the tests. A conductor and a mixture show what instances do.
+@pytest.mark.parametrize(
+    "name, instanced",
+    [
+        ("roughplastic", False),
+        ("mask", False),
+        ("bumped diffuse", False),
+        ("asgconductor", True),
+        *(pytest.param(name, False, marks=pytest.mark.slow) for name in OTHERS),
+        pytest.param("blend", True, marks=pytest.mark.slow),
+    ],
+)
 def test_indirect_light_agrees_with_path_around(name, instanced):
-    if instanced and name not in ("asgconductor", "blend"):
-        pytest.skip("one conductor and one mixture show what instances do")
     ball = {"type": "sphere", "center": [0, -0.3, -0.2], "radius": 0.5, "bsdf": OBJECTS[name]}
     parts = {"ball": ball}
     if instanced:

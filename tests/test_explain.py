@@ -98,7 +98,7 @@ def test_the_maps_radiance_is_what_rendering_adds_to_direct_light():
 
     def render(**parameters):
         plugin = mi.load_dict(OURS | {"photon_count": 300_000} | parameters)
-        return np.array(mi.render(scene, integrator=plugin, spp=32768, seed=0))
+        return np.array(mi.render(scene, integrator=plugin, spp=8192, seed=0))
 
     indirect = render() - render(max_depth=2)
     for pixel in ((1, 4), (4, 2)):

@@ -79,7 +79,7 @@ def test_light_adds_up_and_is_the_same_for_every_use_of_the_map(
     for use in ("global", "caustic", "final_gather", "none"):
         if use == "none":  # many samples: it finds caustics by chance
             as_path_tracer(monkeypatch)
-        spp = 4096 if use == "none" else 64
+        spp = 2048 if use == "none" else 64
         picture, found = rendered(scene, use, spp, 1, photon_count=200_000, initial_radius=0.03)
         assert_adds_up(picture, found)
         means[use] = np.array([found[name].mean() for name in layers.LIGHT])

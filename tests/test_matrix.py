@@ -8,12 +8,9 @@ import pytest
 KNOWN = json.loads(matrix.REFERENCE.read_text())
 # One row of each kind for every run of the tests, each with one use of the map.
 QUICK = {
-    "several lights, diffuse": "global",
     "directionalarea, diffuse": "caustic",
-    "roughconductor 0.4": "caustic",
     "roughplastic 0.1": "final gather",
     "brushed principled": "global",
-    "bumped blend under several": "caustic",
     "two brushed plates": "final gather",
 }
 

@@ -124,8 +124,13 @@ def test_what_takes_most_is_halved_first_and_the_result_fits():
         assert memory.replace(after, eye_samples=2 * after.eye_samples).bytes > limit
 
 
-@pytest.mark.parametrize("film", [{}, {"rfilter": {"type": "gaussian"}, "sample_border": True}])
-@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
+@pytest.mark.parametrize(
+    "sampler, film",
+    [
+        ("multijitter", {"rfilter": {"type": "gaussian"}, "sample_border": True}),
+        pytest.param("independent", {}, marks=pytest.mark.slow),
+    ],
+)
 def test_parts_of_the_film_are_the_picture_of_the_whole(monkeypatch, film, sampler):
     """A film of more pixels than a wavefront may have, and not a multiple of it."""
     definition = room_with_plate(36)

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from importlib import resources
 
 import aniso_pm  # noqa: F401
@@ -270,12 +271,19 @@ def test_a_report_goes_on_from_the_cells_that_are_there(
 def test_a_cell_that_fails_does_not_take_the_others_with_it(
     scene, tmp_path, monkeypatch, capfd, ticking
 ):
-    run = runs.run
+    run, done = runs.run, {}
+
+    def swift(stage, method, radius, seed, budgets):
+        """The first run of a method, a little brighter with each seed."""
+        if method.name not in done:
+            done[method.name] = run(stage, method, radius, seed, budgets)
+        found = done[method.name]
+        return replace(found, images=found.images * (1 + 0.01 * seed))
 
     def failing(stage, method, radius, seed, budgets):
         if method.name == "path" and seed == 1:
             raise RuntimeError("the lamp fell over")
-        return run(stage, method, radius, seed, budgets)
+        return swift(stage, method, radius, seed, budgets)
 
     monkeypatch.setattr(runs, "run", failing)
     names = ("--method", "path", "--method", "isotropic/default", "--seeds", "4", "--budgets", "2")
@@ -287,7 +295,7 @@ def test_a_cell_that_fails_does_not_take_the_others_with_it(
     assert {row["seeds"] for row in found["rows"] if row["method"] == "path"} == {3}
     assert any(r["base"] == "path" and r["value"] for r in found["ratios"])
     # The next time the failed one is tried again, and nothing else.
-    monkeypatch.setattr(runs, "run", run)
+    monkeypatch.setattr(runs, "run", swift)
     assert cli.main(arguments) == 0
     assert {row["seeds"] for row in results(tmp_path)["rows"]} == {4}
 
@@ -389,11 +397,18 @@ def stage_of(world, photons=30_000):
     return runs.Stage(world, world.sensors()[0], {"map": "global"}, {}, photons, 1)
 
 
+@pytest.fixture(scope="module")
+def small_room():
+    """A room and its reference."""
+    mi.set_variant("llvm_ad_rgb")
+    world = mi.load_dict(room(size=16))
+    return world, reference.make(world, world.sensors()[0], spp=8192)
+
+
 @pytest.mark.parametrize("dark", [1.0, 0.9])
-def test_a_dark_method_shows_in_energy_and_bias(monkeypatch, ticking, dark):
+def test_a_dark_method_shows_in_energy_and_bias(small_room, monkeypatch, ticking, dark):
     """Kernels normalised to 0.9 lose a tenth of the indirect light, 3 % of all light here."""
-    world = mi.load_dict(room(size=24))
-    ref = reference.make(world, world.sensors()[0], spp=8192)
+    world, ref = small_room
     estimate = density.estimate
 
     def darker(*arguments, **options):
@@ -403,7 +418,7 @@ def test_a_dark_method_shows_in_energy_and_bias(monkeypatch, ticking, dark):
     monkeypatch.setattr(density, "estimate", darker)
     (method,) = methods.parse("isotropic/default")
     stage = stage_of(world)
-    images = np.array([runs.run(stage, method, 0.1, seed, [1.0]).images[0] for seed in range(5)])
+    images = np.array([runs.run(stage, method, 0.1, seed, [1.0]).images[0] for seed in range(4)])
     weight = metrics.weights(ref.halves)
     mask = np.ones(weight.shape[:2], bool)
     energy = metrics.energy(images, ref.halves, mask)

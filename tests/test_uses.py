@@ -90,7 +90,7 @@ def test_a_use_that_is_given_is_kept(variant_llvm_rgb):
 SCENES = {
     "plastic": lambda: ball(SKY, PLASTIC),
     "glass": lambda: ball(SKY, GLASS),
-    "room": lambda: room_with_ball(size=24),
+    "room": lambda: room_with_ball(size=12),
 }
 
 

@@ -317,6 +317,7 @@ def cases() -> list[Case]:
             "energy over one wavefront's, − 1",
             0.01,
             partial(_many_wavefronts, 2500, 1 << 21),
+            slow=True,
         ),
         Case(
             "wavefronts",
@@ -324,6 +325,7 @@ def cases() -> list[Case]:
             "energy over one wavefront's, − 1",
             0.01,
             partial(_many_wavefronts, 1 << 21, 24 * 24),
+            slow=True,
         ),
     ]
     return found
