@@ -22,8 +22,9 @@ if not (Path(__file__).parent / "plugins").is_dir():
 _llvm.prepare()
 
 # Dr.Jit must load after LLVM.
-from aniso_pm import asg, kernel, ndf, plugins, progress, state, warp  # noqa: E402
-from aniso_pm.denoising import denoise  # noqa: E402
+from aniso_pm import asg, kernel, ndf, plugins, warp  # noqa: E402
+from aniso_pm.pictures.denoising import denoise  # noqa: E402
+from aniso_pm.rendering import progress, state  # noqa: E402
 
 plugins.register()
 

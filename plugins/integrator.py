@@ -10,14 +10,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from aniso_pm import progressive
-from aniso_pm.controls import Batch, Controls
-from aniso_pm.film import pixel_weights as film_weights
-from aniso_pm.layered import develop
-from aniso_pm.pilot import USUAL, automatic_radius
-from aniso_pm.prepared import Unsupported, prepare
-from aniso_pm.settings import Settings
-from aniso_pm.state import Checkpoint
+from aniso_pm.rendering import progressive
+from aniso_pm.rendering.controls import Batch, Controls
+from aniso_pm.rendering.film import pixel_weights as film_weights
+from aniso_pm.rendering.layered import develop
+from aniso_pm.rendering.pilot import USUAL, automatic_radius
+from aniso_pm.rendering.prepared import Unsupported, prepare
+from aniso_pm.rendering.settings import Settings
+from aniso_pm.rendering.state import Checkpoint
 
 
 class AnisoPhotonMapper:

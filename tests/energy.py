@@ -39,7 +39,7 @@ def indirect(scene, integrator, max_depth, spp, seed):
 
     def image(depth, **more):
         plugin = mi.load_dict(integrator | more | {"max_depth": depth})
-        with mock.patch("aniso_pm.survey.pixel_counts", return_value=None):
+        with mock.patch("aniso_pm.rendering.survey.pixel_counts", return_value=None):
             picture = mi.render(scene, integrator=plugin, spp=spp, seed=seed)
         return np.array(picture, dtype=np.float64)
 

@@ -28,7 +28,7 @@ import aniso_pm  # noqa: F401 (registers the plugins)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from aniso_pm import emission
+from aniso_pm.transport import emission
 
 SUSPICION = 4.0
 # Colours weigh differently, so that swapped ones show.

@@ -15,17 +15,7 @@ import aniso_pm  # before drjit and mitsuba: it chooses their LLVM
 import numpy as np
 
 # Conversions, and the references in 50 digits, are those of `aniso-pm stability`.
-from aniso_pm.stability.lanes import arr, f32, flt, unit, vec  # noqa: F401
-from aniso_pm.stability.reference import (  # noqa: F401
-    floats,
-    mp_cross,
-    mp_dot,
-    mp_geodesic_differences,
-    mp_log_g,
-    mp_taylor_axes,
-    mp_unit,
-    mp_vec,
-)
+from aniso_pm.instruments.stability.lanes import arr, f32, flt, unit, vec  # noqa: F401
 
 # --- Between numpy, Dr.Jit and mpmath ------------------------------------------------------------
 

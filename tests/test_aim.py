@@ -7,10 +7,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import aim, density, eye, pilot
-from aniso_pm.film import rays_through
-from aniso_pm.prepared import prepare
-from aniso_pm.settings import Settings
+from aniso_pm.map import density
+from aniso_pm.map.gather_points import take
+from aniso_pm.rendering import pilot
+from aniso_pm.rendering.film import rays_through
+from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.settings import Settings
+from aniso_pm.transport import aim
 
 
 def learned(score, numbers=None, work=None, paths=40_000):
@@ -198,7 +201,7 @@ def test_scores_are_squares_of_what_photons_give(variant_llvm_rgb):
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 1)
     ray, _ = rays_through(world.sensors()[0], sampler, mi.Point2f(16, 14), 0.5)
-    points = eye.take(even.trace(sampler, ray)[2], mi.UInt32(0))
+    points = take(even.trace(sampler, ray)[2], mi.UInt32(0))
     column = dr.zeros(mi.Float, map_.stored)
     disc, r = density.disc(points.n, mi.Float(0.2)), mi.Float(0.2)
     L, count = density.estimate(map_, points, disc, r, 0, True, scores=(column, mi.Float(9.0)))

@@ -5,9 +5,9 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import allotment, pilot
-from aniso_pm import film as films
-from aniso_pm.allotment import Allotment
+from aniso_pm.rendering import allotment, pilot
+from aniso_pm.rendering import film as films
+from aniso_pm.rendering.allotment import Allotment
 from passes import SMALL
 from rooms import room_with_ball
 
@@ -69,7 +69,7 @@ def test_uneven_samples_converge_to_the_same_picture(variant_llvm_rgb, monkeypat
         def settled(*args):
             return replace(pilot.settle(*args), counts=counts)
 
-        monkeypatch.setattr("aniso_pm.progressive.settle", settled)
+        monkeypatch.setattr("aniso_pm.rendering.progressive.settle", settled)
         plugin = mi.load_dict(SMALL | {"passes": 2, "max_depth": 2})
         image = mi.render(scene, integrator=plugin, spp=2 * 64, seed=seed)
         return np.array(image, dtype=np.float64), plugin.statistics

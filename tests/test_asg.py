@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import reference as ref
 from aniso_pm.asg import ASG, product
-from aniso_pm.stability.reference import mp, mpf
+from aniso_pm.instruments.stability.reference import mp, mpf
 from reference import arr, asg, dot, f32, flt, vec
 from scipy import integrate, special, stats
 

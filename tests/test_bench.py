@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm import cli
-from aniso_pm import index as spatial
-from aniso_pm.bench import GROUPS, grid, kernels, memory, rooms, timing, walls
-from aniso_pm.bench.row import Row, as_data, line, summary
+from aniso_pm.instruments.bench import GROUPS, grid, kernels, memory, rooms, timing, walls
+from aniso_pm.instruments.bench.row import Row, as_data, line, summary
+from aniso_pm.map import index as spatial
 
 
 @pytest.fixture(autouse=True)

@@ -15,8 +15,8 @@ import OpenEXR
 import pytest
 from aniso_pm import __version__, cli
 from aniso_pm.errors import one_line
-from aniso_pm.output import plain
-from aniso_pm.state import State
+from aniso_pm.pictures.output import plain
+from aniso_pm.rendering.state import State
 
 SCENE = """<scene version="3.0.0">
   <default name="spp" value="4"/>

@@ -3,7 +3,7 @@
 import aniso_pm  # noqa: F401
 import mitsuba as mi
 import pytest
-from aniso_pm.history import recorded
+from aniso_pm.rendering.history import recorded
 
 # Smaller kernels come and go with the sizes of arrays, and cost milliseconds.
 LARGE = 500

@@ -14,7 +14,7 @@ import pytest
 from aniso_pm.distributed import Options, render, worker
 from aniso_pm.distributed.cluster import connected, local
 from aniso_pm.errors import Failed, InputError
-from aniso_pm.state import Checkpoint, State
+from aniso_pm.rendering.state import Checkpoint, State
 from passes import SMALL
 from rooms import room_with_ball
 from test_parcel import spread  # noqa: F401  (a fixture)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from aniso_pm import cli
-from aniso_pm.settings import Settings
+from aniso_pm.rendering.settings import Settings
 from typer.main import get_command
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import emission
+from aniso_pm.transport import emission
 from energy import indirect
 
 USES = {

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm import cli
-from aniso_pm.explain import explain
+from aniso_pm.instruments.explain import explain
 from rooms import room, room_with_plate
 
 OURS = {"type": "aniso_pm", "map": "global", "photon_count": 20_000, "initial_radius": 0.15}

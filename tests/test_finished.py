@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
-from aniso_pm import denoising, display
 from aniso_pm.errors import InputError
-from aniso_pm.film import pixel_weights, splat
+from aniso_pm.pictures import denoising, display
+from aniso_pm.rendering.film import pixel_weights, splat
 from PIL import Image
 from rooms import room
 from test_cli import OURS, PATH, SCENE, assert_one_line, run  # noqa: F401 (fixture)

@@ -3,7 +3,8 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from aniso_pm import eye, footprint
+from aniso_pm.rendering import footprint
+from aniso_pm.transport import eye
 from rooms import room_with_ball
 
 

@@ -5,8 +5,9 @@ import json
 import aniso_pm  # noqa: F401
 import mitsuba as mi
 import pytest
-from aniso_pm import cli, gallery
-from aniso_pm.report import reference as references
+from aniso_pm import cli
+from aniso_pm.instruments import gallery
+from aniso_pm.instruments.report import reference as references
 
 NAMES = ["brushed_wall", "far_close", "fry_pan", "glass_balls", "plain_room", "teapot"]
 # Sizes that reports use, where they are not the scene's own

@@ -5,7 +5,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import index as spatial
+from aniso_pm.map import index as spatial
 
 CUT2 = 4.0
 

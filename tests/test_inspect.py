@@ -5,9 +5,10 @@ import json
 import matrix
 import mitsuba as mi
 import pytest
-from aniso_pm import cli, inspect
-from aniso_pm.prepared import prepare
-from aniso_pm.settings import Settings
+from aniso_pm import cli
+from aniso_pm.instruments import inspect
+from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.settings import Settings
 
 
 @pytest.fixture(autouse=True)

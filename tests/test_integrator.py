@@ -154,7 +154,7 @@ def test_inside_aov_it_renders_the_same_picture(scene):
 
 
 def test_aov_uses_the_map_that_render_left(scene, monkeypatch):
-    from aniso_pm import photons
+    from aniso_pm.transport import photons
 
     built = []
     build_map = photons.build_map

@@ -9,15 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import reference as ref
-from aniso_pm.kernel import (
-    RULES,
-    coordinates,
-    disc,
-    guarded_axes,
-    kernel_axes,
-    project_to_plane,
-)
-from aniso_pm.stability.reference import mp, mpf
+from aniso_pm.instruments.stability.reference import mp, mpf
+from aniso_pm.kernel import RULES, coordinates, disc, guarded_axes, kernel_axes, project_to_plane
 from reference import arr, asg, dot, f32, flt, unit, vec
 
 EPSILON = float(np.float32(0.02))

@@ -5,11 +5,11 @@ import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import layers
-from aniso_pm.history import recorded
-from aniso_pm.prepared import Prepared
-from aniso_pm.settings import Settings
-from aniso_pm.state import Checkpoint, State, merge
+from aniso_pm.rendering.history import recorded
+from aniso_pm.rendering.prepared import Prepared
+from aniso_pm.rendering.settings import Settings
+from aniso_pm.rendering.state import Checkpoint, State, merge
+from aniso_pm.transport import layers
 from rooms import room
 
 ALL = ",".join(name for name in layers.NAMES if name != "standard_error")

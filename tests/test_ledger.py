@@ -5,7 +5,7 @@ import random
 import pytest
 from aniso_pm.distributed.ledger import Ledger
 from aniso_pm.distributed.pace import Pace
-from aniso_pm.state import numbers
+from aniso_pm.rendering.state import numbers
 from hypothesis import given
 from hypothesis import strategies as st
 

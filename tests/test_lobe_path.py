@@ -5,8 +5,8 @@ import matrix
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.prepared import prepare
-from aniso_pm.settings import Settings
+from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.settings import Settings
 
 
 @pytest.fixture(autouse=True)

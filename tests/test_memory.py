@@ -9,10 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import cli, memory, photons, pilot
-from aniso_pm.prepared import prepare
-from aniso_pm.settings import Settings
-from aniso_pm.state import Checkpoint
+from aniso_pm import cli
+from aniso_pm.rendering import memory, pilot
+from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.settings import Settings
+from aniso_pm.rendering.state import Checkpoint
+from aniso_pm.transport import photons
 from rooms import room, room_with_ball, room_with_plate
 
 GIB = memory.GIB

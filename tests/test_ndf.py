@@ -8,8 +8,8 @@ import aniso_pm  # noqa: F401  # before drjit and mitsuba: it chooses their LLVM
 import mitsuba as mi
 import numpy as np
 import pytest
+from aniso_pm.instruments.stability.reference import mp, mpf
 from aniso_pm.ndf import asg_from_roughness
-from aniso_pm.stability.reference import mp, mpf
 from reference import arr, f32
 
 

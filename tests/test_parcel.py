@@ -8,9 +8,9 @@ import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.digest import camera_entries, differences, scene_entries
 from aniso_pm.distributed.parcel import BadParcel, Parcel
 from aniso_pm.errors import InputError
+from aniso_pm.rendering.digest import camera_entries, differences, scene_entries
 from rooms import room_with_ball
 
 

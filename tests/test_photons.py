@@ -10,7 +10,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import emission, photon_word, photons
+from aniso_pm.map import photon_word
+from aniso_pm.map.photon_map import photon_flux
+from aniso_pm.transport import emission, photons
 
 ALBEDO = 0.5
 UNLIMITED = 0xFFFFFFFE
@@ -46,7 +48,7 @@ def build(scene, count, seed, max_depth, rr_depth, expected=0, **options):
 
 
 def total_flux(map_):
-    flux = photons.photon_flux(map_, dr.arange(mi.UInt32, map_.stored), mi.Bool(True))
+    flux = photon_flux(map_, dr.arange(mi.UInt32, map_.stored), mi.Bool(True))
     return dr.sum(mi.Float64(flux.x))[0] / map_.emitted
 
 

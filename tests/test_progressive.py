@@ -10,11 +10,11 @@ import matrix
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import progress, progressive, schedule
-from aniso_pm.accumulate import Sums, mean_and_variance, relative_standard_error
-from aniso_pm.settings import Settings
-from aniso_pm.state import Checkpoint, State
-from aniso_pm.stopping import Stopping
+from aniso_pm.rendering import progress, progressive, schedule
+from aniso_pm.rendering.accumulate import Sums, mean_and_variance, relative_standard_error
+from aniso_pm.rendering.settings import Settings
+from aniso_pm.rendering.state import Checkpoint, State
+from aniso_pm.rendering.stopping import Stopping
 from passes import SMALL, close, integrator, load, render
 from rooms import room, room_with_ball
 

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import random_light
-from aniso_pm import emission
+from aniso_pm.transport import emission
 from random_light import T, colour, texture
 
 RNG = np.random.default_rng(3)

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import random_scenes
-from aniso_pm import film
+from aniso_pm.rendering import film
 
 
 @pytest.fixture(autouse=True)

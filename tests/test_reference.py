@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 from aniso_pm import cli
 from aniso_pm.errors import InputError
-from aniso_pm.report import reference as references
+from aniso_pm.instruments.report import reference as references
 
 SCENE = """<scene version="3.0.0">
   <default name="albedo" value="0.5"/> <default name="light" value="100"/>

@@ -11,11 +11,9 @@ import jsonschema
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import cli, density
+from aniso_pm import cli
 from aniso_pm.errors import InputError
-from aniso_pm.film import pixel_weights
-from aniso_pm.prepared import prepare
-from aniso_pm.report import (
+from aniso_pm.instruments.report import (
     cells,
     denoised,
     experiment,
@@ -26,8 +24,11 @@ from aniso_pm.report import (
     regions,
     runs,
 )
-from aniso_pm.report.plan import Plan
-from aniso_pm.settings import Settings
+from aniso_pm.instruments.report.plan import Plan
+from aniso_pm.map import density
+from aniso_pm.rendering.film import pixel_weights
+from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.settings import Settings
 from conftest import tick
 from rooms import room, room_with_ball, room_with_plate
 
@@ -109,8 +110,8 @@ def results(out):
 
 
 def schema():
-    text = resources.files("aniso_pm.report").joinpath("results.schema.json").read_text()
-    return json.loads(text)
+    file = resources.files("aniso_pm.instruments.report").joinpath("results.schema.json")
+    return json.loads(file.read_text())
 
 
 # --- Files ---

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from aniso_pm.report import metrics, sweep
+from aniso_pm.instruments.report import metrics, sweep
 
 SHAPE = (24, 32, 3)
 MASK = np.ones(SHAPE[:2], bool)

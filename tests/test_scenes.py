@@ -6,7 +6,7 @@ import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.report import reference as references
+from aniso_pm.instruments.report import reference as references
 
 SCENES = Path(__file__).parents[1] / "scenes"
 

@@ -14,10 +14,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm import cli
+from aniso_pm.instruments.stability import all_cases, case, fuzz, page, planes, regions, soak
+from aniso_pm.instruments.stability import reference as ref
+from aniso_pm.instruments.stability.lanes import arr, asg, ellipse_error, lobes, off_by_sigmas, vec
 from aniso_pm.kernel import RULES, kernel_axes
-from aniso_pm.stability import all_cases, case, fuzz, page, planes, regions, soak
-from aniso_pm.stability import reference as ref
-from aniso_pm.stability.lanes import arr, asg, ellipse_error, lobes, off_by_sigmas, vec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -192,10 +192,10 @@ def test_a_short_soak_changes_no_picture():
 
 @pytest.fixture
 def few_cases(monkeypatch):
-    import aniso_pm.stability
+    import aniso_pm.instruments.stability
 
     cases = [_case(1e-4), _case(0.5, 1.0, "cap"), _case(math.nan)]
-    monkeypatch.setattr(aniso_pm.stability, "all_cases", lambda: cases)
+    monkeypatch.setattr(aniso_pm.instruments.stability, "all_cases", lambda: cases)
 
 
 def test_the_command_writes_json_page_and_markdown(few_cases, tmp_path, capsys):

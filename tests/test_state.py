@@ -7,7 +7,7 @@ import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.state import Checkpoint, State, StateError, describe, merge
+from aniso_pm.rendering.state import Checkpoint, State, StateError, describe, merge
 from passes import close, integrator, load, render
 from rooms import room, room_with_plate
 
@@ -156,7 +156,7 @@ def test_another_scene_is_refused_by_what_changed(states, change, named):
 def test_the_same_scene_is_recognised_whatever_the_order_of_its_objects(states):
     """Meshes are merged in the order of their addresses, and computed normals are sums in the
     order of threads: neither is a different scene."""
-    from aniso_pm.digest import scene_entries
+    from aniso_pm.rendering.digest import scene_entries
 
     definition = room_with_plate(8)
     backwards = dict(reversed(definition.items()))
@@ -166,7 +166,7 @@ def test_the_same_scene_is_recognised_whatever_the_order_of_its_objects(states):
 
 
 def test_a_texture_is_part_of_the_scene(tmp_path):
-    from aniso_pm.digest import scene_entries
+    from aniso_pm.rendering.digest import scene_entries
 
     def entries(value):
         data = mi.TensorXf(np.full((4, 4, 3), value, dtype=np.float32))
@@ -250,7 +250,7 @@ def test_checkpoints_of_films_with_alpha_crop_and_other_colours(tmp_path):
     path = tmp_path / "a.state"
     image = render(scene, integrator(passes=2), 4, checkpoint=Checkpoint(path))
     state = State.load(path)
-    from aniso_pm import film as films
+    from aniso_pm.rendering import film as films
 
     film = films.from_description(state.film)
     films.show_array(film, state.arrays["first"])

@@ -8,8 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import density, eye, kernel, photon_word, photons, summed
-from aniso_pm import index as spatial
+from aniso_pm import kernel
+from aniso_pm.map import density, photon_word, summed
+from aniso_pm.map import index as spatial
+from aniso_pm.map.gather_points import GatherPoints
+from aniso_pm.map.photon_map import PhotonMap
 
 COUNT, POINTS = 40_000, 200
 
@@ -34,7 +37,7 @@ def scattered(rng, colours="any", normals=None):
     packed = np.zeros((COUNT, 4))
     packed[:, :3] = flux
     packed = packed[order.numpy()].astype(np.float32)
-    map_ = photons.PhotonMap(1000, COUNT, 0, index, mi.Float(packed.ravel()), None, None)
+    map_ = PhotonMap(1000, COUNT, 0, index, mi.Float(packed.ravel()), None, None)
     return dataclasses.replace(map_, sums=summed.build(map_))
 
 
@@ -44,7 +47,7 @@ def vectors(a):
 
 def gather_points(rng, caustic=None):
     at = np.column_stack([rng.random((POINTS, 2)), np.zeros(POINTS)])
-    return eye.GatherPoints(
+    return GatherPoints(
         lane=dr.arange(mi.UInt32, POINTS),
         p=mi.Point3f(vectors(at)),
         n=mi.Normal3f(0, 0, 1),

@@ -4,7 +4,7 @@ import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.photon_word import encode_normal, one_sheet
+from aniso_pm.map.photon_word import encode_normal, one_sheet
 
 
 @pytest.fixture(autouse=True)

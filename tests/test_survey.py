@@ -3,10 +3,10 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import pilot, plan
-from aniso_pm.prepared import prepare
-from aniso_pm.settings import Settings
-from aniso_pm.tiles import SAMPLES, Tiles
+from aniso_pm.rendering import pilot, plan
+from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.settings import Settings
+from aniso_pm.rendering.tiles import SAMPLES, Tiles
 from rooms import room, room_with_ball
 
 

@@ -7,10 +7,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm import pilot
-from aniso_pm.prepared import prepare
-from aniso_pm.settings import Settings
-from aniso_pm.tiles import Tiles
+from aniso_pm.rendering import pilot
+from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.settings import Settings
+from aniso_pm.rendering.tiles import Tiles
 from rooms import room_with_ball
 
 
@@ -136,7 +136,7 @@ def test_what_uses_leave_to_eye_paths_is_told_apart(variant_llvm_rgb, scene):
 
 @pytest.mark.parametrize("chosen", ["global", "caustic", "none"])
 def test_every_choice_gives_the_picture_of_path(variant_llvm_rgb, monkeypatch, chosen):
-    from aniso_pm import progressive
+    from aniso_pm.rendering import progressive
 
     scene = mi.load_dict(ball(SKY, PLASTIC))
 
@@ -172,7 +172,7 @@ def test_after_path_tracing_sample_path_traces(variant_llvm_rgb):
 
 def test_noise_of_a_film_filter(variant_llvm_rgb):
     """∫f²/(∫f)²: 1 for a box; 4/9 for a tent; 1/(4πσ²) for a Gaussian that is not cut."""
-    from aniso_pm.film import noise_share
+    from aniso_pm.rendering.film import noise_share
 
     def share(**rfilter):
         return noise_share(mi.load_dict({"type": "hdrfilm", "rfilter": rfilter}))

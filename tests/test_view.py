@@ -16,7 +16,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from aniso_pm.errors import InputError
-from aniso_pm.state import Checkpoint
+from aniso_pm.rendering.state import Checkpoint
 from aniso_pm.view import server
 from aniso_pm.view.session import Session
 from aniso_pm.view.snapshot import Snapshot

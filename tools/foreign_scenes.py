@@ -27,7 +27,7 @@ from pathlib import Path
 import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
-from aniso_pm.report.metrics import weights
+from aniso_pm.instruments.report.metrics import weights
 
 USES = {
     "as installed": {},

@@ -13,8 +13,8 @@ from pathlib import Path
 import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
-from aniso_pm.report import reference as references
-from aniso_pm.report.reference import relative_rmse
+from aniso_pm.instruments.report import reference as references
+from aniso_pm.instruments.report.reference import relative_rmse
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 # The close-up of each scene: left, top, right, bottom in pixels.

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
-from aniso_pm.report import reference as references
-from aniso_pm.report.metrics import weights
+from aniso_pm.instruments.report import reference as references
+from aniso_pm.instruments.report.metrics import weights
 from make_pictures import SCENES
 
 # What is looked at: left, top, width, height in pixels of the reference.

@@ -13,8 +13,8 @@ import aniso_pm  # noqa: F401
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from aniso_pm.report import reference as references
-from aniso_pm.report.metrics import weights
+from aniso_pm.instruments.report import reference as references
+from aniso_pm.instruments.report.metrics import weights
 from make_pictures import CLOSE_UPS, SCENES, render
 
 KERNELS = [("isotropic", "lobe", True)] + [

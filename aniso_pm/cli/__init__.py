@@ -12,9 +12,9 @@ import sys
 from typing import Annotated
 
 import typer
-from aniso_pm import output
 from aniso_pm._version import __version__
 from aniso_pm.errors import Failed, InputError, is_interrupt, one_line
+from aniso_pm.pictures import output
 
 from . import bench, cluster, examine, explain, reference, render, report, scenes, view
 from .common import INTERRUPTED, InterruptError

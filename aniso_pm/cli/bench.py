@@ -32,7 +32,7 @@ def bench(
     (such as ">= 0.85"; null where the line informs only), met (true, false or null) and note.
     Exit status 0 also where a target is missed.
     """
-    from aniso_pm.bench import GROUPS
+    from aniso_pm.instruments.bench import GROUPS
 
     groups = groups or ["all"]
     for group in groups:
@@ -44,9 +44,9 @@ def bench(
     wanted = [group for group in GROUPS if group in groups or "all" in groups]
     set_variant(variant)
 
-    from aniso_pm import output
-    from aniso_pm.bench import measure
-    from aniso_pm.bench.row import HEADER, as_data, line, summary
+    from aniso_pm.instruments.bench import measure
+    from aniso_pm.instruments.bench.row import HEADER, as_data, line, summary
+    from aniso_pm.pictures import output
 
     if not as_json:
         print(HEADER)

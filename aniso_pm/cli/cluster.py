@@ -43,8 +43,8 @@ def cluster(
     """
     from dataclasses import asdict, replace
 
-    from aniso_pm import output
     from aniso_pm.distributed.model import Conditions, Costs, table
+    from aniso_pm.pictures import output
 
     width, by, height = size.partition("x")
     if not (by and width.isdigit() and height.isdigit() and int(width) * int(height) > 0):

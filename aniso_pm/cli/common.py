@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from aniso_pm import _llvm, output
+from aniso_pm import _llvm
 from aniso_pm.errors import InputError, is_interrupt, one_line
+from aniso_pm.pictures import output
 
 INTERRUPTED = 130
 

@@ -36,9 +36,9 @@ def inspect(
     set_variant(variant)
     with mitsuba_log(quiet=False):
         world, _, integrator = load(scene, parse_defines(define or []), 0)
-        from aniso_pm import inspect as inspection
-        from aniso_pm.prepared import prepare
-        from aniso_pm.settings import Settings
+        from aniso_pm.instruments import inspect as inspection
+        from aniso_pm.rendering.prepared import prepare
+        from aniso_pm.rendering.settings import Settings
 
         settings = getattr(integrator, "settings", None) or Settings()
         try:
@@ -75,8 +75,8 @@ def stability(
     make_directory(out)
     set_variant(variant)
 
-    from aniso_pm.doctor import versions
-    from aniso_pm.stability import all_cases, case, page
+    from aniso_pm.instruments.doctor import versions
+    from aniso_pm.instruments.stability import all_cases, case, page
 
     rows = []
     with mitsuba_log(quiet=True):
@@ -98,7 +98,7 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
 ) -> int:
     """Say what is installed and whether it works, with the fix for what does not."""
-    from aniso_pm import doctor as examination
+    from aniso_pm.instruments import doctor as examination
 
     checks = examination.examine()
     print(examination.as_json(checks) if as_json else examination.as_text(checks))

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from aniso_pm import output
 from aniso_pm.errors import InputError, one_line
+from aniso_pm.pictures import output
 
 from .common import Define, SceneFile, Variant, load, mitsuba_log, parse_defines, set_variant
 
@@ -51,7 +51,7 @@ def explain(
     set_variant(variant)
     with mitsuba_log(quiet=False):
         world, camera, integrator = load(scene, parse_defines(define or []), sensor)
-        from aniso_pm import explain as explanation
+        from aniso_pm.instruments import explain as explanation
 
         try:
             found = explanation.explain(

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from aniso_pm import output
 from aniso_pm.errors import InputError
+from aniso_pm.pictures import output
 
 Png = Annotated[bool, typer.Option("--png", help="Also write a PNG beside it.")]
 Exposure = Annotated[
@@ -53,7 +53,7 @@ class Pictures:
         out: Path, png: bool, exposure: float, tonemap: str, bits: int, denoise: bool
     ) -> Pictures:
         """Raises InputError or OutputError, in one line, for what cannot be written."""
-        from aniso_pm import denoising, display
+        from aniso_pm.pictures import denoising, display
 
         if out.suffix.lower() != ".exr":
             raise InputError(f"cannot write '{out}': the output's name must end in .exr")
@@ -81,7 +81,7 @@ class Pictures:
 
         weights  of the filter that the picture was made with (``film.pixel_weights``).
         """
-        from aniso_pm import denoising, display
+        from aniso_pm.pictures import denoising, display
 
         layers = dict(layers or {})
         colours = display.colours(film)

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from aniso_pm import output
 from aniso_pm.errors import InputError, is_interrupt
-from aniso_pm.progress import shown
+from aniso_pm.pictures import output
+from aniso_pm.rendering.progress import shown
 
 from .common import (
     INTERRUPTED,
@@ -65,7 +65,7 @@ def reference(
     one for each size of film, for example), then in the cache (aniso_pm/references in
     $XDG_CACHE_HOME or ~/.cache).
     """
-    from aniso_pm.report import reference as references
+    from aniso_pm.instruments.report import reference as references
 
     if seconds is None and spp is None:
         raise InputError("say when to end: --time SECONDS, --spp N or both")

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from aniso_pm import output
 from aniso_pm.errors import InputError, is_interrupt, one_line
-from aniso_pm.progress import bar
+from aniso_pm.pictures import output
+from aniso_pm.rendering.progress import bar
 
 from .common import (
     INTERRUPTED,
@@ -130,7 +130,7 @@ def render(
         rules = {name: value for name, value in rules.items() if value is not None}
         kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state)
         _ask_for_layers(integrator, layer_names, denoise)
-        from aniso_pm.film import pixel_weights
+        from aniso_pm.rendering.film import pixel_weights
 
         made_by = {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
 
@@ -147,7 +147,7 @@ def render(
         # --- Render ---
         state_file = out.with_suffix(".state")
         if kept is not None:
-            from aniso_pm.state import Checkpoint
+            from aniso_pm.rendering.state import Checkpoint
 
             output.sweep(state_file)
             output.sweep(out)
@@ -218,9 +218,9 @@ def merge(
     may occur twice. Jobs that still render may be merged, too: with what they have so far. --passes
     tells on standard error which passes are missing from the picture.
     """
-    from aniso_pm import film as films
-    from aniso_pm.state import State, StateError, describe, missing
-    from aniso_pm.state import merge as merged
+    from aniso_pm.rendering import film as films
+    from aniso_pm.rendering.state import State, StateError, describe, missing
+    from aniso_pm.rendering.state import merge as merged
 
     pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
     try:
@@ -341,7 +341,7 @@ def _done(record: dict[str, Any], out: Path, picture: Path | None) -> str:
 
 def record_of(integrator, camera) -> dict[str, Any]:
     """What made a picture, for its header."""
-    from aniso_pm.doctor import versions
+    from aniso_pm.instruments.doctor import versions
 
     statistics = dict(getattr(integrator, "statistics", None) or {})
     kind = type(integrator)

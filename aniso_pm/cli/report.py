@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 from aniso_pm.errors import InputError, is_interrupt
-from aniso_pm.progress import shown
+from aniso_pm.rendering.progress import shown
 
 from .common import (
     INTERRUPTED,
@@ -78,8 +78,8 @@ def report(
         raise InputError(
             f"this needs {error.name}, which is not installed: pip install jinja2 matplotlib scipy"
         ) from error
-    from aniso_pm.report import conclusions, make
-    from aniso_pm.report.plan import Plan
+    from aniso_pm.instruments.report import conclusions, make
+    from aniso_pm.instruments.report.plan import Plan
 
     set_variant(variant)
     asked = {

@@ -8,8 +8,8 @@ from textwrap import fill
 from typing import Annotated
 
 import typer
-from aniso_pm import gallery
 from aniso_pm.errors import InputError
+from aniso_pm.instruments import gallery
 
 
 def scenes(

@@ -135,7 +135,7 @@ def view(
 
 
 def _watched(path: Path):
-    from aniso_pm.state import StateError
+    from aniso_pm.rendering.state import StateError
     from aniso_pm.view.watched import Watched
 
     try:

@@ -17,7 +17,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 from aniso_pm.errors import Failed, InputError, one_line
-from aniso_pm.state import Checkpoint
+from aniso_pm.rendering.state import Checkpoint
 
 from .cluster import require
 from .dispatch import Elsewhere

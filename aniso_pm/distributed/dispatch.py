@@ -23,10 +23,10 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import mitsuba as mi
-from aniso_pm import digest
-from aniso_pm.controls import Batch
 from aniso_pm.errors import Failed, is_interrupt, one_line
-from aniso_pm.progressive import Run
+from aniso_pm.rendering import digest
+from aniso_pm.rendering.controls import Batch
+from aniso_pm.rendering.progressive import Run
 
 from . import worker
 from .crew import Crew, gone

@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Iterable
 
-from aniso_pm.state import joined, numbers
+from aniso_pm.rendering.state import joined, numbers
 
 Ranges = list[list[int]]
 

@@ -24,7 +24,7 @@ def measured(say: Callable[[str], Any], workers: int = 2) -> dict[str, Any]:
     say: called with a line for each figure.
     """
     import mitsuba as mi
-    from aniso_pm import gallery
+    from aniso_pm.instruments import gallery
 
     from . import Elsewhere, Options, Parcel
     from .cluster import local

@@ -93,7 +93,7 @@ def render(job: Job, passes: list[list[int]], task: str) -> dict[str, Any]:
 
 def add(*parts: dict[str, Any]) -> dict[str, Any]:
     """One for several of what :func:`render` or this function returned."""
-    from aniso_pm.state import add_counts, joined
+    from aniso_pm.rendering.state import add_counts, joined
 
     first, *others = parts
     arrays = {name: array.copy() for name, array in first["arrays"].items()}
@@ -119,11 +119,11 @@ class _Rendering:
     def __init__(self, job: Job, threads: int, limit: float | None, directory: Path):
         import drjit as dr
         import mitsuba as mi
-        from aniso_pm import progressive
-        from aniso_pm.controls import Controls
-        from aniso_pm.digest import camera_entries, differences, scene_entries
-        from aniso_pm.prepared import prepare
-        from aniso_pm.settings import Settings
+        from aniso_pm.rendering import progressive
+        from aniso_pm.rendering.controls import Controls
+        from aniso_pm.rendering.digest import camera_entries, differences, scene_entries
+        from aniso_pm.rendering.prepared import prepare
+        from aniso_pm.rendering.settings import Settings
 
         mine = versions()
         for name, version in job.versions.items():
@@ -156,7 +156,7 @@ class _Rendering:
 
     def passes(self, ranges):
         """(Batch of these passes, seconds spent on compilation)."""
-        from aniso_pm.state import numbers
+        from aniso_pm.rendering.state import numbers
 
         compiled = self.run.stopping.compiling
         self.run.begin()

@@ -14,9 +14,9 @@ import threading
 from typing import Any
 from urllib.parse import urlsplit
 
-from ..display import TONEMAPS
 from ..errors import InputError
 from ..kernel import RULES
+from ..pictures.display import TONEMAPS
 
 _COOKIE = "aniso_pm_token"
 _POLICY = "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'"

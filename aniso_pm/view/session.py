@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, is_interrupt, one_line
-from ..explain import explain
-from ..film import describe
+from ..instruments.explain import explain
+from ..rendering.film import describe
 from .snapshot import Snapshot, status_of
 
 # What may be changed from outside, as parameters of the integrator.

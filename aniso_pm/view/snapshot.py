@@ -11,9 +11,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..denoising import denoise
-from ..display import displayed
 from ..errors import InputError
+from ..pictures.denoising import denoise
+from ..pictures.display import displayed
 
 PICTURE, DENOISED = "picture", "denoised"
 # What one request computes the next may have.

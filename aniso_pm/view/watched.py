@@ -9,9 +9,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .. import film as films
 from ..errors import InputError
-from ..state import State, StateError
+from ..rendering import film as films
+from ..rendering.state import State, StateError
 from .snapshot import Snapshot, status_of
 
 # Seconds between looks at the file.

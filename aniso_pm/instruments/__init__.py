@@ -1,0 +1,1 @@
+"""What tells rather than renders: why, how well, how fast, how stable."""

@@ -1,0 +1,165 @@
+"""Photons where they have been left: columns of numbers in the order of a spatial index.
+
+A map says what its light paths have left and how many there were; what a photon's word says is
+``photon_word``'s business, which photons an ellipse holds ``index``'s, what they sum up to
+``density``'s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import index as spatial
+from .photon_word import decode, is_caustic
+
+
+@dataclass(frozen=True)
+class PhotonMap:
+    """Photons in the order of their spatial index.
+
+    emitted    light paths traced: the estimate divides by it.
+    stored     photons in the map; 0 means that the arrays are None.
+    rejected   fluxes that were not finite and were dropped: photons, and light paths that end.
+    index      word of a point: octahedral normal in 24 bits, number of path segments in 7, caustic
+               or not in the highest.
+    flux       W, interleaved channels, padded to a power of two.
+    direction  where the light came from, 32 bits octahedral; None where no receiver needs it.
+    wavelengths  nm, in spectral variants; the flux is W/nm then.
+    sums       summed.Sums of the index's nodes, or None.
+    origins    Origins, or None.
+    """
+
+    emitted: int
+    stored: int
+    rejected: int
+    index: Any
+    flux: Any
+    direction: Any
+    wavelengths: Any
+    sums: Any = None
+    origins: Origins | None = None
+
+
+@dataclass(frozen=True)
+class Origins:
+    """Where the photons of a map come from.
+
+    path     number of the light path that left the photon in each slot (mi.UInt32).
+    numbers  the five random numbers with which each path began, (paths, 5).
+    """
+
+    path: Any
+    numbers: np.ndarray
+
+
+EMPTY = PhotonMap(0, 0, 0, None, None, None, None)
+
+
+@dataclass
+class Photons:
+    """Columns that light paths fill, in any order; None where a scene needs no such column."""
+
+    position: Any
+    word: Any
+    flux: Any
+    direction: Any
+    path: Any
+
+
+def caustics(map_: PhotonMap) -> PhotonMap:
+    """The caustic photons of a map that marks them, as a map of their own."""
+    if map_.stored == 0:
+        return map_
+    point = dr.gather(mi.Vector4f, map_.index.points, dr.arange(mi.UInt32, map_.stored))
+    word = dr.reinterpret_array(mi.UInt32, point.w)
+    slot = dr.compress(is_caustic(word))
+    point = dr.gather(mi.Vector4f, map_.index.points, slot)
+    photons = Photons(
+        mi.Point3f(point.x, point.y, point.z),
+        dr.reinterpret_array(mi.UInt32, point.w),
+        photon_flux(map_, slot, True),
+        None if map_.direction is None else dr.gather(mi.UInt32, map_.direction, slot),
+        None if map_.origins is None else dr.gather(mi.UInt32, map_.origins.path, slot),
+    )
+    dr.eval(photons)
+    nothing = replace(map_, stored=0, index=None, flux=None, direction=None)
+    return indexed(photons, dr.width(slot), nothing)
+
+
+def indexed(photons: Photons, stored: int, nothing: PhotonMap) -> PhotonMap:
+    """``nothing``, a map without photons, with the first ``stored`` of the columns in order."""
+    if stored == 0:
+        return nothing
+    index, order = spatial.build(_cut(photons, "position", stored), _cut(photons, "word", stored))
+    # What has been put in order is dropped before the next column is.
+    direction, origins = None, nothing.origins
+    if photons.direction is not None:
+        direction = dr.gather(mi.UInt32, _cut(photons, "direction", stored), order)
+        dr.eval(direction)
+    if origins is not None:
+        origins = replace(origins, path=dr.gather(mi.UInt32, _cut(photons, "path", stored), order))
+        dr.eval(origins.path)
+    sorted_flux = dr.empty(mi.Float, stored * _flux_width())
+    flux = dr.gather(mi.Spectrum, _cut(photons, "flux", stored), order)
+    dr.scatter(sorted_flux, pack_flux(flux), dr.arange(mi.UInt32, stored))
+    del order, flux
+    dr.eval(sorted_flux)
+    spatial.give_back(stored)
+    return replace(
+        nothing,
+        stored=stored,
+        index=index,
+        flux=sorted_flux,
+        direction=direction,
+        origins=origins,
+    )
+
+
+def _cut(photons, name: str, entries: int):
+    """A column without its spare room, taken out of ``photons``: who gets it has it alone."""
+    column = getattr(photons, name)
+    setattr(photons, name, None)
+    if dr.depth_v(column) == 1:
+        return dr.reshape(type(column), column, entries, shrink=True)
+    return type(column)(*(dr.reshape(type(x), x, entries, shrink=True) for x in column))
+
+
+def photon_flux(photons: PhotonMap, slot, active):
+    """Flux (mi.Spectrum, W) of the photon in a slot."""
+    return read_flux(photons.flux, slot, active)
+
+
+def read_flux(column, slot, active):
+    """An entry of a column of fluxes that ``pack_flux`` has made."""
+    packed = dr.gather(_packet(), column, slot, active)
+    return mi.Spectrum(*(packed[k] for k in range(dr.size_v(mi.Spectrum))))
+
+
+def photon_direction(photons: PhotonMap, slot, active):
+    """Unit vector from the photon in a slot to where its light came from."""
+    return decode(dr.gather(mi.UInt32, photons.direction, slot, active), 16)
+
+
+def _flux_width() -> int:
+    return 1 if dr.size_v(mi.Spectrum) == 1 else 4
+
+
+def flux_bytes() -> int:
+    """Of the flux of one photon in the current variant."""
+    return 4 * _flux_width()
+
+
+def _packet():
+    """Array type of one photon's flux: a power of two of channels is gathered at once."""
+    return mi.Vector1f if _flux_width() == 1 else mi.Vector4f
+
+
+def pack_flux(spectrum):
+    """A flux as it is stored, padded."""
+    channels = [spectrum[k] for k in range(dr.size_v(mi.Spectrum))]
+    return _packet()(*(channels + [mi.Float(0)] * (_flux_width() - len(channels))))

@@ -1,0 +1,124 @@
+"""Which pixel gets how many eye samples in a pass, and the lanes that trace them.
+
+Pixel p takes n_p samples in every pass, on average n of them, more where a pilot saw more noise
+(see ``survey``). Each sample goes into the film with the weight n/n_p: density times weight is the
+same everywhere, so that reconstruction filters see what they would with even samples, and every
+n_p >= 1 converges to the same picture. n_p does not depend on the pass: the stratified sequence of
+a pixel goes on from pass to pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import own
+
+# Samples of a pixel as multiples of the mean: the fewest and the most.
+LEAST, MOST = 0.25, 8.0
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """One wavefront of eye samples, those of a pixel in consecutive lanes.
+
+    pixel   number of the pixel, row by row from the film's border on.
+    sample  number of the sample in the sequence of its pixel.
+    weight  with which it goes into the film; None: 1.
+    count   lanes.
+    """
+
+    pixel: Any
+    sample: Any
+    weight: Any
+    count: int
+
+
+@dataclass(frozen=True)
+class Allotment:
+    """Samples of ``pixels`` pixels in a pass: ``each`` in the mean; ``counts`` (integers) says how
+    many pixel by pixel, None: all alike."""
+
+    pixels: int
+    each: int
+    counts: np.ndarray | None = None
+    _kept: dict[Any, tuple] = field(default_factory=dict, repr=False)  # lanes of the last wavefront
+
+    def wavefronts(self, index: int, more: int, before: int, most: int) -> Iterator[tuple]:
+        """(Lanes, share of the pass that is done after them) of pass ``index``.
+
+        more    samples that every pixel takes in this pass beyond its number.
+        before  such samples in all passes before.
+        most    lanes of a wavefront, about. Fewer than there are pixels: parts of the film.
+        """
+        n: Any = (self.each if self.counts is None else self.counts) + more
+        largest = int(np.max(n))
+        at_once = min(self.pixels, most)
+        if at_once < self.pixels:
+            slices = largest
+        elif self.counts is None:
+            slices = -(-largest // (most // self.pixels))
+        else:  # rounding up adds less than one sample a pixel
+            room = most - self.pixels
+            slices = min(largest, math.ceil(int(n.sum()) / room)) if room > 0 else largest
+        for part in range(slices):
+            low, high = n * part // slices, n * (part + 1) // slices
+            for first in range(0, self.pixels, at_once):
+                some = min(at_once, self.pixels - first)
+                done = (part + (first + some) / self.pixels) / slices
+                if self.counts is None:
+                    start = index * self.each + before + low
+                    yield self._even(first, some, start, high - low), done
+                    continue
+                here = slice(first, first + some)
+                if not (high - low)[here].any():
+                    continue
+                start = index * self.counts[here] + before + low[here]
+                yield self._uneven(first, start, (high - low)[here], n[here], more), done
+
+    def _even(self, first, pixels, start, each) -> Lanes:
+        count = pixels * each
+        lane, each = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, each)
+        pixel = lane // each
+        sample = lane - pixel * each + dr.opaque(mi.UInt32, start)
+        return Lanes(pixel + dr.opaque(mi.UInt32, first), sample, None, count)
+
+    def _uneven(self, first, start, counts, n, more) -> Lanes:
+        """``start``: number of each pixel's first sample; all else is the same in every pass."""
+        key = (first, more, counts.tobytes())
+        if key not in self._kept:
+            self._kept.clear()
+            pixel = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
+            place = np.arange(len(pixel), dtype=np.uint32)
+            place -= np.repeat((np.cumsum(counts) - counts).astype(np.uint32), counts)
+            weight = np.repeat(((self.each + more) / n).astype(np.float32), counts)
+            self._kept[key] = (
+                own(mi.UInt32, pixel),
+                own(mi.UInt32, place),
+                own(mi.Float, weight),
+            )
+        pixel, place, weight = self._kept[key]
+        sample = dr.gather(mi.UInt32, own(mi.UInt32, start.astype(np.uint32)), pixel) + place
+        return Lanes(pixel + dr.opaque(mi.UInt32, first), sample, weight, dr.width(pixel))
+
+
+def in_proportion(noise: np.ndarray, each: int) -> np.ndarray | None:
+    """Samples of each pixel in proportion to ``noise``, exactly ``each`` in the mean; None where
+    that is too little to tell pixels apart."""
+    if each * LEAST < 1 or not noise.mean() > 0:
+        return None
+    share = noise / noise.mean()
+    for _ in range(8):  # bounds and mean together
+        share = np.clip(share, LEAST, MOST)
+        share /= share.mean()
+    # What rounding takes from a pixel its neighbour gets.
+    counts = np.diff(np.round(np.cumsum(share) * each), prepend=0).astype(np.int64)
+    counts = np.maximum(counts, 1)
+    counts[np.argmax(counts)] += each * counts.size - counts.sum()
+    return None if (counts == each).all() else counts

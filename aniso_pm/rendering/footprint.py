@@ -1,0 +1,94 @@
+"""How wide a pixel is where an eye path reads the photon map, and what that means for kernels.
+
+With f the footprint of a pixel at a gather point (world units, its width there, measured along the
+path), w the width of the kernel in pixels (``survey`` finds it pixel by pixel), and r_i the
+bandwidth of pass i (0-based, see ``schedule``), the kernel's radius is
+
+    r(p) = clip(w f r_i/r_0, l_i r_i, 2 r_i),      l_i = 1/max(4, i + 1).
+
+Everything shrinks from pass to pass, so that the mean over passes converges as with one radius; r_i
+and l_i are functions of i alone, however many passes there will be: passes that were rendered apart
+add up.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import own
+
+# Widest kernels, in pixels, that pilots have tried (see ``survey``).
+TRIED = 8.0
+# Kernels of the first passes may be narrower than the bandwidth by so much, kernels of all passes
+# wider.
+_LEAST, _MOST = 4, 2
+
+
+@dataclass  # not frozen: Dr.Jit traverses it
+class Footprint:
+    """Bandwidth of a gather point as a share of that of its pass.
+
+    start   width of a pixel at the camera, ``spread`` per world unit of path, both as a share of
+            r_0.
+    least   smallest share in this pass, above 0 and at most 1.
+    widths  of kernels in pixels: one number, or one for each pixel.
+    pixel   of each eye path; None where there is one width.
+    """
+
+    start: Any
+    spread: Any
+    least: Any
+    widths: Any
+    pixel: Any = None
+
+    def share(self, distance, lane, widest=math.inf):
+        """Of a gather point of eye path ``lane``, ``distance`` world units of path from the
+        camera. widest: that a kernel shall be, in pixels."""
+        width = self.widths
+        if self.pixel is not None:
+            width = dr.gather(mi.Float, width, dr.gather(mi.UInt32, self.pixel, lane))
+        width = dr.minimum(width, widest)
+        return dr.clip(width * dr.fma(self.spread, distance, self.start), self.least, _MOST)
+
+    def in_pass(self, index: int) -> Footprint:
+        """The same in pass ``index`` (0-based)."""
+        return replace(self, least=dr.opaque(mi.Float, least_share(index)))
+
+    def seen_by(self, pixel) -> Footprint:
+        """The same for eye paths of these pixels (UInt32)."""
+        return replace(self, pixel=pixel) if dr.width(self.widths) > 1 else self
+
+
+def of(sensor, radius: float, widths=1.0) -> Footprint:
+    """Footprints of the pixels of a sensor, seen in its middle; kernels that are never narrower
+    until ``in_pass`` says by how much.
+
+    radius  bandwidth r_0 of the first pass, world units.
+    widths  of kernels in pixels: a number or a flat array, one for each sampled pixel.
+    """
+    centre, aperture = mi.Point2f(0.5), mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    ray, _ = sensor.sample_ray(time, mi.Float(0.5), centre, aperture)
+    size = sensor.film().size()
+    # Neighbours along both axes: the wider one counts.
+    start = spread = mi.Float(0)
+    for step in (mi.Vector2f(1 / size[0], 0), mi.Vector2f(0, 1 / size[1])):
+        beside, _ = sensor.sample_ray(time, mi.Float(0.5), centre + step, aperture)
+        start = dr.maximum(start, dr.norm(beside.o - ray.o))
+        spread = dr.maximum(spread, dr.norm(beside.d - ray.d))
+    unit = dr.rcp(dr.opaque(mi.Float, radius))
+    width = own(mi.Float, np.array(widths, np.float32))
+    found = Footprint(start * unit, spread * unit, mi.Float(1), width)
+    dr.make_opaque(found.start, found.spread, found.least, found.widths)
+    return found
+
+
+def least_share(index: int) -> float:
+    """Smallest share of the bandwidth of pass ``index`` (0-based) that a kernel may have."""
+    return 1 / max(_LEAST, index + 1)

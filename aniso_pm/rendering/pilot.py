@@ -1,0 +1,176 @@
+"""The bandwidth of the first pass, from a small pilot of photons and eye paths.
+
+Every eye path that reaches a receiver widens its disc by factors of 2 until it holds enough pilot
+photons. A median of these radii, scaled to the photons of a full pass, is the bandwidth: robust
+from a coin to a stadium, because it looks at the densities where the camera does. Each point counts
+by the light that it receives: a caustic on a dark floor sets the bandwidth, not the floor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..map import density
+from ..map.gather_points import take
+from ..map.photon_map import EMPTY
+from ..transport import aim
+from . import survey
+from .film import one_each, wavelengths
+from .prepared import PILOT, Prepared, stream_seed
+
+# Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
+PHOTONS_PER_KERNEL = 60
+# Range of the automatic number of light paths: the most take half a gigabyte.
+FEWEST, MOST = 10_000, 5_000_000
+# Light paths and eye paths of the pilot, and photons that a disc must hold to be measured.
+_PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
+# Light paths for which the bandwidth is chosen before their number is.
+USUAL = 250_000
+# Range of radii as shares of the scene's extent: 1.2e-5 · 2^13 = 0.1.
+_SMALLEST, LARGEST, _STEPS = 1.2e-5, 0.1, 14
+
+
+def camera_rays(sensor, seed: int):
+    """Rays through random points of the film's crop window."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 2)), _RAYS)
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    ray, _ = sensor.sample_ray(
+        mi.Float(sensor.shutter_open()), mi.Float(0.5), sampler.next_2d(), aperture
+    )
+    return one_each(ray, _RAYS)
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What a rendering needs to know before its first pass, given or chosen.
+
+    use     of the map (see ``eye``).
+    errors  relative MSE that each use promises, where there was a choice (see ``survey``).
+    count   light paths per pass.
+    radius  bandwidth of the first pass, world units.
+    each    eye samples of a pixel in a pass (see ``survey``).
+    share   of the eye paths of each pixel that gather (see ``eye.Thinning``).
+    counts  samples of each pixel in a pass (see ``allotment``), or None: all alike.
+    widths  of the kernels of each pixel, in pixels (see ``footprint``).
+    aim     of light paths (aim.Learned), or None: they begin evenly.
+    """
+
+    use: str
+    errors: dict[str, float | None]
+    count: int
+    radius: float
+    each: int
+    share: np.ndarray
+    counts: np.ndarray | None
+    widths: np.ndarray
+    aim: aim.Learned | None
+
+    def applied(self, scene: Prepared) -> Prepared:
+        """The scene with the use of its map, and with the number and aim of light paths."""
+        scene = replace(scene, chosen=self.use, aim=self.aim.aim() if self.aim else None)
+        return scene.with_(photon_count=self.count)
+
+
+def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False) -> Settled:
+    """What the parameters do not give is chosen, by a function of scene, parameters and seed.
+
+    each     eye samples of a pixel in a pass.
+    exactly  so many; else, where passes go on without end, there may be fewer.
+    """
+    colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
+    count, radius = scene.settings.photon_count, scene.settings.initial_radius
+    if scene.undecided:
+        scene = replace(scene, chosen="survey")
+    pilot = scene.with_(photon_count=_PATHS)
+    maps = [
+        pilot.photon_map(stream_seed(seed, PILOT), k, 0, colours, remember=True)
+        if scene.needs_map
+        else EMPTY
+        for k in (0, 1)
+    ]
+    found = survey.look(scene, sensor, radius or None, seed, each, exactly, maps, count)
+    count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
+    # Aimed photons are closer together where they show.
+    worth = count / found.aim.variance if found.aim else count
+    radius = radius or radius_at(found.points, found.map, scene, worth)
+    return Settled(
+        found.use,
+        found.errors,
+        count,
+        radius,
+        found.each,
+        found.share,
+        found.counts,
+        found.widths,
+        found.aim,
+    )
+
+
+def _rounded(number: float) -> int:
+    """To two digits, so that machines whose arithmetic differs in the last ones agree."""
+    return int(round(number, 1 - int(math.log10(number)))) if number >= 1 else 0
+
+
+def _weighted_median(radii) -> float:
+    """Median with weights 1/r² (proportional to the density of photons, hence to the light that
+    the point receives): half of the light is estimated at smaller radii, half at larger ones."""
+    radii = np.sort(radii)
+    light = np.cumsum(radii.astype(np.float64) ** -2)
+    return float(radii[np.searchsorted(light, 0.5 * light[-1])])
+
+
+def photons_per_path(scene: Prepared, seed: int) -> float:
+    """Photons that a light path leaves in the mean."""
+    map_ = scene.with_(photon_count=_PATHS).photon_map(stream_seed(seed, PILOT), 0)
+    return map_.stored / max(map_.emitted, 1)
+
+
+def automatic_radius(scene: Prepared, rays, seed: int, map_=None) -> float:
+    """As :func:`radius_at`, for what any number of camera rays see. map_: a pilot's, if there is
+    one."""
+    if map_ is None:
+        pilot = scene.with_(photon_count=min(scene.settings.photon_count, _PATHS))
+        map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 1)), dr.width(rays))
+    points = scene.trace(sampler, rays)[2] if map_.stored else None
+    return radius_at(points, map_, scene, scene.settings.photon_count)
+
+
+def radius_at(points, map_, scene: Prepared, light_paths: float) -> float:
+    """Bandwidth (world units) at which kernels hold PHOTONS_PER_KERNEL photons of so many light
+    paths, in the median over gather points (GatherPoints or None).
+
+    Returns a hundredth of the scene's extent where there is nothing to gather, and never more than
+    a tenth of it.
+    """
+    extent = scene.extent
+    if points is None or not map_.stored:
+        return 0.01 * extent
+    count = dr.width(points.lane)
+    if count > _RAYS:
+        points = take(points, dr.arange(mi.UInt32, _RAYS) * (count // _RAYS))
+        count = _RAYS
+    radius = dr.full(mi.Float, _SMALLEST * extent, count)
+    looking = dr.full(mi.Bool, True, count)
+    dr.eval(looking, radius)
+    for _ in range(_STEPS):
+        disc = density.disc(points.n, radius)
+        _, found = density.estimate(map_, points, disc, radius, scene.gather_depth, looking)
+        # The number of photons grows with the area, which makes the last step exact.
+        exact = radius * dr.sqrt(_ENOUGH / mi.Float(dr.maximum(found, 1)))
+        enough = looking & (found >= _ENOUGH)
+        looking &= ~enough
+        radius = dr.select(enough, exact, dr.select(looking, 2 * radius, radius))
+        dr.eval(looking, radius)
+        if not dr.any(looking):
+            break
+    median = _weighted_median(radius.numpy())
+    more_photons = light_paths / map_.emitted
+    return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), LARGEST * extent)

@@ -1,0 +1,244 @@
+"""What two photon maps and pairs of eye paths say about a use of the map: variances, and the best
+that can be done with it.
+
+Two independent means a, b over k = 4 stratified samples of one pixel are read from two independent
+photon maps A, B. With the gathered light g and all the rest l, weighted by 1/(mean² + floor²) so
+that errors are relative,
+
+    V_r = k⟨(l_a − l_b)²⟩/2                    of an eye path, without what it gathers,
+    V_g = k⟨(g_aA − g_bA)(g_aB − g_bB)⟩/2      of a gather, were there no end of photons,
+    V_gp = k⟨(g_aA − g_bA)²⟩/2 − V_g           of a gather, by the photons that it alone meets,
+    V_p = ⟨(g_aA − g_aB)(g_bA − g_bB)⟩/2       of photons that a pixel's samples share.
+
+A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot)
+has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths
+being what the film's filter leaves of it, that of shared photons the root of it), and costs
+n P (C + q C_g) + N C_p, P the number of pixels. For given n, variance times cost is smallest at
+
+    q² = C (V_g + V_gp)/(V_r C_g),        N² = n² P (C + q C_g) B / (A C_p),
+
+and with samples of a pixel in proportion to √((V_r + (V_g + V_gp)/q)/C) there, C the work of an eye
+path of that pixel. Costs are counted, not timed, so that every machine decides alike.
+
+*Widths of kernels.* All this is gathered with kernels of several widths w, in pixels. B falls as
+1/w². With D = g(8) − g(4) the product D_aA D_bB has neither the noise of eye paths nor of photons
+in it: its mean is the square of what bias changes from 4 to 8 pixels. Bias grows as w² where light
+is smooth and as √w in the mean around an edge; between them, as w^1.5,
+
+    bias²(w) = ⟨D D'⟩ (w/4)³/(2^1.5 − 1)²,    so    w⁵ = 2 B₁/(3 M N) · 4³ (2^1.5 − 1)²/⟨D D'⟩
+
+makes bias² + B₁/(w² M N) smallest after M = 32 passes. Means are taken over tiles and their
+neighbours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..transport import aim
+from . import footprint
+from .tiles import SAMPLES, Tiles, smooth
+
+# Widths of kernels that are compared, and the range of those that are chosen, in pixels.
+NARROW, WIDE = 0.5 * footprint.TRIED, footprint.TRIED
+_THINNEST, _WIDEST = 1.0, 32.0
+# Passes that the widths are right for, however many there will be: passes add up.
+PASSES = 32
+# Smallest share of eye paths that gather.
+LEAST_SHARE = 1 / 8
+# Work of a gather, each photon it meets, a light path, a photon it leaves; an eye path is about 1.
+_GATHER, _MET, LIGHT_PATH, LEFT = 1.2, 1 / 40, 0.6, 0.4
+# Variance of an eye sample among a few hundred stratified ones, as a share of that among SAMPLES:
+# 0.59 among 52 and falling, in direct light.
+STRATIFIED = 0.45
+# Rounds in which the decisions, each of which depends on the others, settle.
+_ROUNDS = 4
+# Variance beyond the first gathered part, where stratification does less, as such a share.
+_LATER_STRATIFIED = 0.85
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a use of the map gives to the pairs: light from map a, b through narrow kernels and
+    through wide ones, (pairs, 2); photons that an eye path meets, gather points that it leaves;
+    light paths and photons of a map; how to aim those."""
+
+    a: np.ndarray
+    b: np.ndarray
+    wide_a: np.ndarray
+    wide_b: np.ndarray
+    met: float
+    points: float
+    emitted: int
+    stored: int
+    aim: aim.Learned | None
+
+    @property
+    def light(self) -> np.ndarray:
+        return 0.5 * (self.wide_a + self.wide_b)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The best that can be done with a use of the map; see the module's head and ``Survey``. share
+    and widths are those of tiles, error is the relative MSE, work that of a pass; path_work (of an
+    eye path), gathered (light) and noise (variance of gathers) are those of pairs."""
+
+    tiles: Tiles
+    use: str
+    each: int
+    share: np.ndarray
+    light_paths: float
+    widths: np.ndarray
+    error: float
+    work: float
+    path_work: np.ndarray
+    gathered: np.ndarray
+    noise: np.ndarray
+    aim: aim.Learned | None = None
+
+    @staticmethod
+    def of(longest: float, each: int, *given, **more) -> Plan:
+        """Of passes whose work is ``longest`` at most, if they can be that short."""
+        plan = Plan._of(each, *given, **more)
+        if plan.work > longest and each > 1:
+            plan = Plan._of(max(1, int(each * longest / plan.work)), *given, **more)
+        return plan
+
+    @staticmethod
+    def _of(
+        each: int,
+        tiles: Tiles,
+        choose: bool,
+        light_paths: int | None,
+        filtered: float,
+        total: float,
+        whole,
+        use: str,
+        weight,
+        v_own,
+        found: Found | None = None,
+        later: Any = 0.0,
+        work: Any = None,
+    ) -> Plan:
+        """
+        choose  widths of kernels.
+        filtered  variance of eye paths that the film leaves (``film.noise_share``).
+        total   work after which ``error`` is that of the mean over all passes.
+        whole   work of path tracing.
+        v_own   of an eye path, without what it gathers; later: what it has more because it goes on
+                beyond the first gathered part.
+        found   in the map; None: there is none.
+        work    of an eye path; None: of path tracing.
+        """
+        work = whole if work is None else work
+        v_eye = STRATIFIED * float(v_own.mean()) + _LATER_STRATIFIED * float(np.mean(later))
+        v_eye = filtered * max(v_eye, 0.0)
+        if found is None:
+            pass_ = each * tiles.pixels * float(work.mean())
+            error = v_eye / each * pass_ / total
+            share = np.full(1, 1.0 if use == "none" else LEAST_SHARE)
+            nothing = np.zeros(len(whole))
+            return Plan(
+                tiles, use, each, share, 0.0, np.ones(1), error, pass_, work, nothing, nothing
+            )
+
+        # --- Variances and bias² of each pair, relative to the light there ---
+        a, b, emitted = found.a, found.b, found.emitted
+        v_gather = tiles.trusted(filtered * within(a, b, weight))
+        shared, alone = of_photons(found.wide_a - found.wide_b, weight)
+        mid_shared, mid_alone = of_photons(a - b, weight)
+        alone, mid_alone = filtered * alone, filtered * mid_alone
+        # Neighbours have these in common, as far as kernels reach: a few pixels.
+        root = math.sqrt(filtered)
+        shared, mid_shared = root * shared, root * mid_shared
+        v_alone, v_shared = tiles.trusted(mid_alone), tiles.trusted(mid_shared)
+        changed_a, changed_b = found.wide_a - a, found.wide_b - b
+        change = changed_a[:, 0] * changed_b[:, 1] + changed_a[:, 1] * changed_b[:, 0]
+        change *= 0.5 * weight
+
+        # --- Decisions ---
+        share, paths = np.ones(len(whole)), float(light_paths or 5 * emitted)
+        narrow, wide = (NARROW, WIDE) if choose else (1.0, 1.0)
+        widths = np.full(len(whole), narrow)
+        eye_work = float(work.mean())
+        light, met = LIGHT_PATH + LEFT * found.stored / emitted, found.met
+        aimed = 1.0
+        if found.aim:
+            light, met = light * found.aim.work, met * found.aim.photons
+            aimed = found.aim.variance
+        for _ in range(_ROUNDS):
+            own = 1 / (share * each)
+            # A pass that a pixel reads less than once counts when it is read.
+            often = np.maximum(1, own)
+            b_1 = wide**2 * (often * shared + own * alone)
+            b_1 += narrow**2 * (often * mid_shared + own * mid_alone)
+            b_1 *= 0.5 * emitted * aimed
+            if choose:
+                widths = kernel_widths(tiles, b_1, change, PASSES * paths).ravel()
+            area = float(np.mean((widths / narrow) ** 2))
+            thinner = (narrow / widths) ** 2 * aimed * emitted / paths
+            gather = _GATHER * found.points + _MET * met * area * paths / emitted
+            if v_eye > 0:
+                worth = eye_work / (v_eye * gather)
+                share = np.sqrt((v_gather + v_alone * thinner) * worth)
+                # Less than one in a pass: then a gather is alone with what it would share.
+                more = np.sqrt((v_gather + (v_alone + v_shared) * thinner) * worth)
+                share = np.where(share * each < 1, np.minimum(more, 1 / each), share)
+            # In steps, so that machines whose arithmetic differs in the last digits agree.
+            share = np.ceil(16 * np.clip(share, LEAST_SHARE, 1)) / 16
+            eye_noise = max(v_eye + float((v_gather / share).mean()), 1e-30)
+            gather *= float(share.mean())
+            by_photons = max(0.0, float((b_1 / widths**2).mean()))
+            if not light_paths:
+                costs = (eye_work + gather) / (light * tiles.pixels)
+                paths = max(each * tiles.pixels * math.sqrt(by_photons * costs / eye_noise), 1.0)
+        pass_ = each * tiles.pixels * (eye_work + gather) + paths * light
+        error = (eye_noise / each + by_photons / paths) * pass_ / total
+        error += _bias2(float(np.mean(change * (widths / NARROW) ** 3))) if choose else 0.0
+        noise = (v_gather + v_alone * thinner) / (filtered * share)
+        return Plan(
+            tiles,
+            use,
+            each,
+            share,
+            paths,
+            widths,
+            error,
+            pass_,
+            work + gather,
+            found.light.mean(1),
+            noise,
+            found.aim,
+        )
+
+
+def _bias2(change: float) -> float:
+    """From the square of what changes between kernels of 4 and 8 pixels."""
+    return max(change, 0.0) / (2**1.5 - 1) ** 2
+
+
+def kernel_widths(tiles: Tiles, photons, change, light_paths: float) -> np.ndarray:
+    """Of kernels in each tile, in pixels (see the module's head). photons: B₁ of each pair."""
+    photons = smooth(tiles.grid(photons))
+    photons = np.maximum(photons, 1e-3 * max(float(photons.mean()), 1e-30))
+    error = tiles.uncertainty(change)
+    bias2 = (2**1.5 - 1) ** -2 * (np.maximum(smooth(tiles.grid(change)), 0) + error)
+    fifth = 2 * photons * NARROW**3 / (3 * light_paths * np.maximum(bias2, 1e-30))
+    return np.clip(fifth**0.2, _THINNEST, _WIDEST)
+
+
+def within(v, w, weight):
+    """Of a single sample: half the product of differences within each pair."""
+    return 0.5 * SAMPLES * weight * (v[:, 0] - v[:, 1]) * (w[:, 0] - w[:, 1])
+
+
+def of_photons(difference, weight):
+    """Variance by photons, of what all samples of a pixel share and of what each has alone.
+    difference: between the two maps."""
+    shared = 0.5 * weight * difference[:, 0] * difference[:, 1]
+    return shared, SAMPLES * (0.25 * weight * (difference**2).sum(1) - shared)

@@ -1,0 +1,450 @@
+"""A Mitsuba scene with what was found out about it once, and the stages of a pass on it."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..map import density, photon_word, summed
+from ..map.gather_points import GatherPoints, map_tree, take
+from ..map.photon_map import EMPTY, PhotonMap, flux_bytes
+from ..transport import emission, eye, layers, photons
+from ..transport.aim import Aim
+from ..transport.split import split
+from .footprint import TRIED, Footprint
+from .needs import Needs, read_scene
+from .settings import Settings
+
+# Independent streams of random numbers.
+EYE, PROBE, PHOTONS, PILOT, COLOUR, THINNING = range(6)
+
+
+class Unsupported(ValueError):
+    """The variant or the scene asks for something that this integrator does not do."""
+
+
+@dataclass(frozen=True)
+class Radiance:
+    """What one wavefront of eye paths saw.
+
+    L         radiance, W/m²/sr, per eye path.
+    valid     alpha is 1, per eye path.
+    gathered  density.Gathered of all gather points, a list: Lambertian receivers, other ones.
+    seen      layers.Seen, where somebody asks for layers.
+    """
+
+    L: Any
+    valid: Any
+    gathered: list[density.Gathered]
+    seen: layers.Seen | None = None
+
+
+@dataclass(frozen=True)
+class Launch:
+    """The two functions that take most time to trace; frozen, they are traced once and replayed."""
+
+    light: Callable = photons.light_paths
+    eye: Callable = eye.eye_paths
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scene, its needs, the parameters, and the decisions that follow from them."""
+
+    scene: Any
+    needs: Needs
+    settings: Settings
+    hide_emitters: bool
+    emission: emission.Emission | None
+    launch: Launch = Launch()
+    light_wavefront: int | None = None  # light paths at once; None: photons.WAVEFRONT
+    footprint: Footprint | None = None  # of pixels; None: one bandwidth for all of a pass
+    chosen: str | None = None  # use of the map that a pilot has found best, see ``undecided``
+    aim: Aim | None = None  # of light paths, if a pilot has found that it pays
+
+    def with_(self, **changes) -> Prepared:
+        """The same scene with some parameters changed."""
+        return replace(self, settings=self.settings.with_(**changes))
+
+    def thawed(self) -> Prepared:
+        """The same scene with nothing frozen."""
+        return replace(self, launch=Launch())
+
+    def frozen(self) -> Prepared:
+        """The same scene for many passes: paths are traced in Python once and then replayed."""
+        # Scenes that nobody uses any more must not vanish while Dr.Jit records this one: their
+        # materials are part of the same virtual function calls.
+        gc.collect()
+        return replace(
+            self, launch=Launch(dr.freeze(photons.light_paths), dr.freeze(eye.eye_paths))
+        )
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the scene's bounding box, world units."""
+        return float(dr.norm(self.scene.bbox().extents()))
+
+    @property
+    def follow_lobes(self) -> bool:
+        """Keep the reflection lobes of eye paths?"""
+        return self.settings.kernel == "anisotropic" and len(self.needs.lobes) > 0
+
+    @property
+    def deep(self) -> bool:
+        """May gather points lie deeper than the first vertex?"""
+        return len(self.needs.chains) > 0
+
+    @property
+    def undecided(self) -> bool:
+        """Is it for a pilot to say how the map is best used? ``map=auto`` has no choice where there
+        are no surfaces that paths walk on (nothing casts caustics: path tracing is best), nor where
+        there is light that only photons find (it takes the global map)."""
+        automatic = self.settings.map == "auto" and not self.settings.final_gather
+        return automatic and self.use == "global" and not self.needs.unseen and not self.chosen
+
+    @property
+    def use(self) -> str:
+        """How eye paths use the map; see ``eye``. As long as nobody has chosen, ``auto`` is
+        "global" where there is anything to choose."""
+        if self.chosen:
+            return self.chosen
+        wanted = bool(self.needs.receivers) and self.settings.depth_limit > self.min_segments
+        if not wanted or self.emission is None:
+            return "none"
+        if self.settings.final_gather:
+            return "final_gather"
+        if not self.deep and not self.needs.unseen and self.settings.map != "global":
+            return "none"
+        return "global" if self.settings.map == "auto" else self.settings.map
+
+    @property
+    def photons_are_dispensable(self) -> bool:
+        """May a pilot choose path tracing? Not where eye paths cannot find all light by themselves
+        (a point emits it, or a direction has all of it: what such a light sends over a mirror is
+        found by photons only), and not where somebody says how many photons, or how large kernels
+        are to be."""
+        delta = mi.EmitterFlags.Delta
+        asked = self.settings.photon_count or self.settings.initial_radius
+        return not asked and not any(mi.has_flag(e.flags(), delta) for e in self.scene.emitters())
+
+    @property
+    def crowding(self) -> int:
+        """Share of a wavefront's eye paths that may be traced at once: where paths leave gather
+        points at several vertices, fewer of them fit into the same memory."""
+        if not self.needs_map:
+            return 1
+        if self.use == "caustic":
+            return 8
+        return 2 if self.use == "final_gather" or self.needs.general else 1
+
+    @property
+    def min_segments(self) -> int:
+        """Segments of the shortest light path in the map."""
+        return 1 if self.needs.unseen else 2
+
+    @property
+    def needs_map(self) -> bool:
+        """Is there anything for photons to do?"""
+        return self.use != "none"
+
+    @property
+    def bytes_per_photon(self) -> int:
+        """Of a map at rest, index included: position and word, flux, direction, and one box of 16
+        bytes for every leaf and every inner node (at most 2 nodes for 4 photons), which have their
+        sums, too, where ``gather_tolerance`` asks for them."""
+        node = 16 + (20 + flux_bytes() if self.settings.gather_tolerance else 0)
+        return 16 + flux_bytes() + (4 if self.needs.general else 0) + node // 2
+
+    @property
+    def gather_depth(self) -> int:
+        """The limit that ``density.estimate`` has to test photons against: none if there is no
+        limit, or if all gather points lie at the first vertex and the map keeps the limit. Paths of
+        more than ``photon_word.SEGMENTS_MAX`` segments are not told apart."""
+        limit = self.settings.max_depth
+        tested = self.deep or self.use != "global"
+        return limit if tested and 0 < limit <= photon_word.SEGMENTS_MAX else 0
+
+    @property
+    def kernel_options(self) -> density.KernelOptions:
+        """How gather points get their kernels."""
+        s = self.settings
+        return density.KernelOptions(
+            self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
+        )
+
+    @property
+    def light_layers(self) -> bool:
+        """Does anybody ask for light by how it came?"""
+        return any(name in layers.LIGHT for name in self.settings.layer_names)
+
+    @property
+    def surface_layers(self) -> bool:
+        """Does anybody ask for what eye paths see?"""
+        wanted = (*layers.SURFACE, "denoising")
+        return any(name in wanted for name in self.settings.layer_names)
+
+    def photon_map(
+        self,
+        seed: int,
+        index: int,
+        expected: int = 0,
+        wavelengths=None,
+        lap=lambda stage: None,
+        remember: bool = False,
+    ) -> PhotonMap:
+        """Photon map of pass ``index``; empty where nothing in the scene could use one.
+
+        wavelengths: nm, of the photons, in spectral variants. lap: called with the name of each
+        stage that ends, "photons" and "index". remember: where light paths began.
+        """
+        if not self.needs_map:
+            return EMPTY
+        s = self.settings
+        plain = "marked" if self.light_layers else "ignored"
+        options = photons.TraceOptions(
+            s.depth_limit - 1,
+            s.rr_depth,
+            {"global": plain, "caustic": "only"}.get(self.use, "marked"),
+            bool(self.needs.general),
+            s.gather_roughness,
+            bool(self.needs.unseen),
+            bool(self.needs.bent),
+            wavelengths,
+            self.aim,
+            remember,
+        )
+        seed = stream_seed(seed, PHOTONS, index)
+        map_ = photons.build_map(
+            self.scene,
+            self.emission,
+            s.photon_count,
+            seed,
+            options,
+            expected,
+            self.launch.light,
+            lap,
+            self.light_wavefront,
+        )
+        if s.gather_tolerance > 0 and map_.stored:
+            map_ = replace(map_, sums=summed.build(map_))
+            lap("index")
+        return map_
+
+    def trace(
+        self, sampler, ray, expected: int = 0, see=None, thinning=None, for_layers: bool = False
+    ):
+        """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``, and
+        ``eye.eye_paths`` for ``see``, ``eye.Thinning``. for_layers: keep what layers need that are
+        asked for."""
+        s = self.settings
+        options = eye.WalkOptions(
+            self.use,
+            s.depth_limit,
+            s.rr_depth,
+            self.min_segments,
+            self.hide_emitters,
+            self.needs_map,
+            self.follow_lobes and self.needs_map,
+            self.deep,
+            bool(self.needs.general),
+            s.gather_roughness,
+            self.footprint is not None and self.needs_map,
+            thinning,
+            for_layers and self.light_layers,
+            for_layers and self.surface_layers,
+        )
+        launch = partial(self.launch.eye, see=see) if see else self.launch.eye
+        return eye.trace(self.scene, sampler, ray, options, expected, launch)
+
+    def gather(
+        self,
+        map_,
+        radius,
+        seed: int,
+        points: GatherPoints,
+        wavelengths=None,
+        scores=None,
+        for_layers: bool = False,
+    ) -> list[density.Gathered]:
+        """Reflected radiance at gather points, edges compensated where that is asked for.
+
+        radius       bandwidth, world units; a Dr.Jit array, so that its value is no part of the
+                     kernel.
+        wavelengths  nm, of the eye paths, in spectral variants.
+        scores       None, or a column of zeros, one for each photon, and the weight of each eye
+                     path (see ``density.estimate``).
+        for_layers   find what layers need that are asked for.
+        """
+        if points.lambertian is None:
+            return [self._gather(map_, radius, seed, points, None, scores, for_layers)]
+        parts = []
+        for general in (False, True):
+            index = dr.compress(points.lambertian != general)
+            if dr.width(index):
+                some = take(points, index)
+                surface = None
+                if general:
+                    roughness = self.settings.gather_roughness
+                    surface = density.Surface.at(self.scene, some, roughness, wavelengths)
+                parts.append(self._gather(map_, radius, seed, some, surface, scores, for_layers))
+        return parts
+
+    def bandwidth(self, points: GatherPoints, radius):
+        """Of each gather point, world units. radius: of the pass."""
+        if self.footprint is None:
+            return radius
+        return radius * self.footprint.share(points.distance, points.lane)
+
+    def thickness(self, points: GatherPoints, radius):
+        """Bandwidth by which photons are on the same surface (``density.SLAB``): that of kernels
+        as wide as pilots try them, where they are wider. Farther off lies who knows what."""
+        if self.footprint is None:
+            return radius
+        return radius * self.footprint.share(points.distance, points.lane, TRIED)
+
+    def _gather(self, map_, radius, seed, points, surface, scores, for_layers) -> density.Gathered:
+        if scores is not None:
+            scores = scores[0], dr.gather(mi.Float, scores[1], points.lane)
+        thickness = self.thickness(points, radius)
+        radius = self.bandwidth(points, radius)
+        kernel, follows, degenerate = density.kernels(points, radius, self.kernel_options)
+        L, count = density.estimate(
+            map_,
+            points,
+            kernel,
+            thickness,
+            self.gather_depth,
+            mi.Bool(True),
+            surface,
+            self.settings.gather_tolerance,
+            scores,
+        )
+        light: Any = None
+        if for_layers and self.light_layers:
+            light = split(
+                L,
+                self.use,
+                bool(self.needs.unseen),
+                map_,
+                points,
+                kernel,
+                thickness,
+                self.gather_depth,
+                surface,
+                self.settings.gather_tolerance,
+            )
+        lost = mi.Bool(False)
+        if self.settings.edge_compensation:
+            inverse, lost = density.probe_surface(
+                self.scene, seed, points, kernel, thickness, count > 0
+            )
+            L *= inverse
+            light = map_tree(lambda part: part * inverse, light)
+        clamped, capped = follows & kernel.clamped, follows & kernel.capped
+        found = density.Gathered(points.lane, L, count, follows, clamped, capped, degenerate, lost)
+        if for_layers:
+            wanted = "radius" in self.settings.layer_names
+            found = replace(found, light=light, radius=mi.Float(radius) if wanted else None)
+        # One kernel for all of it: a reduction by itself would run the whole gather again.
+        dr.eval(found)
+        return found
+
+    def radiance(
+        self,
+        sampler,
+        ray,
+        map_,
+        radius,
+        seed: int,
+        expected: int = 0,
+        lap=lambda stage: None,
+        thinning: eye.Thinning | None = None,
+        for_layers: bool = False,
+    ) -> Radiance:
+        """Radiance along camera rays: their own share and the map's.
+
+        radius    bandwidth, world units: a Dr.Jit array.
+        seed        of the random numbers that density estimation takes.
+        expected    gather points to make room for.
+        lap         called with the name of each stage that ends.
+        thinning    which eye paths gather; None: all.
+        for_layers  find what layers need that are asked for.
+        """
+        L, valid, points = self.trace(
+            sampler, ray, expected, thinning=thinning, for_layers=for_layers
+        )
+        lap("eye")
+        gathered, seen = [], None
+        if isinstance(L, layers.Seen):
+            seen, L = L, L.radiance
+        if points is not None and map_.stored:
+            gathered = self.gather(
+                map_, radius, seed, points, map_.wavelengths, for_layers=for_layers
+            )
+
+            def add(total, part, lane):
+                # Directly: sums of each thread's own would have their size in the code.
+                dr.scatter_add(total, part, lane, mode=dr.ReduceMode.Direct)
+                return total
+
+            L = mi.Spectrum(L)
+            for found in gathered:
+                add(L, found.radiance, found.lane)
+                if found.light is not None:
+                    map_tree(partial(add, lane=found.lane), seen.light, found.light)
+            dr.eval(L, seen)
+        lap("gather")
+        return Radiance(L, valid, gathered, seen)
+
+
+def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
+    """Read the scene. Raises Unsupported with one sentence where it cannot be rendered."""
+    if mi.is_polarized:
+        raise Unsupported(
+            f'aniso_pm: variant "{mi.variant()}" is not supported (photons carry no '
+            "polarisation); choose llvm_ad_rgb or another unpolarized variant"
+        )
+    _repair_bounds(scene)  # before light from outside is aimed at them
+    try:
+        needs = read_scene(scene, settings.gather_roughness)
+        source = emission.prepare(scene) if scene.emitters() else None
+    except ValueError as error:
+        raise Unsupported(str(error)) from None
+    prepared = Prepared(scene, needs, settings, hide_emitters, source)
+    radius, extent = settings.initial_radius, prepared.extent
+    if radius and scene.shapes() and not 1e-7 * extent <= radius <= 10 * extent:
+        raise Unsupported(
+            f'aniso_pm: parameter "initial_radius" is {radius:g}, but the scene is {extent:g} '
+            f"large; give a length between {1e-7 * extent:g} and {10 * extent:g}, or 0 (automatic)"
+        )
+    return prepared
+
+
+def _repair_bounds(scene):
+    """Give every mesh its bounding box.
+
+    Mitsuba merges meshes that share a BSDF and leaves the merged one without a bounding box. The
+    scene then seems smaller than it is, or infinite: lights that surround the scene aim their
+    photons elsewhere and there is no extent to choose a bandwidth from.
+    """
+    broken = [shape for shape in scene.shapes() if not shape.bbox().valid()]
+    for shape in broken:
+        parameters = mi.traverse(shape)
+        if "vertex_positions" in parameters:
+            parameters.set_dirty("vertex_positions")
+            parameters.update()
+    if broken:
+        scene.parameters_changed()
+        for emitter in scene.emitters():
+            emitter.set_scene(scene)
+
+
+def stream_seed(seed: int, stream: int, index: int = 0) -> int:
+    """Seed of an independent stream of random numbers, by rounds of a block cipher (TEA)."""
+    return mi.sample_tea_32(mi.sample_tea_32(seed, 8 * index + stream)[0], 0x5EED)[0]

@@ -1,0 +1,242 @@
+"""The state of an unfinished rendering on disk: passes done, their sums, what they depend on.
+
+Format: a NumPy archive (.npz) of the arrays first, square, cross (see ``accumulate``), layers where
+there are any (see ``layered``), and "header", JSON text with the format's version, the identity
+(see ``digest``), the passes as half-open ranges, statistics, the seconds spent, and a SHA-256 of
+all the rest. Files appear whole or not at all and are never trusted: what is truncated, altered or
+of another version is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..pictures import output
+from ..transport.layers import parse
+from .accumulate import mean_and_variance
+from .digest import differences
+from .layered import develop
+
+VERSION = 1
+_ARRAYS = ("first", "square", "cross")
+_OPTIONAL = ("layers", "denoising")
+
+
+class StateError(ValueError):
+    """A state cannot be used: it is damaged, or belongs to another rendering."""
+
+
+@dataclass
+class State:
+    """Passes that were rendered.
+
+    identity    what every pass depends on but its number (``digest.identity``).
+    film        what ``film.from_description`` makes a film from.
+    passes      half-open ranges of pass numbers, ascending, disjoint and not touching.
+    seconds     rendering time spent on them.
+    statistics  of the renderer, over these passes.
+    arrays      ``Sums.arrays()``, and the sums of layers that were asked for (``layered``).
+    """
+
+    identity: dict[str, Any]
+    film: dict[str, Any]
+    passes: list[list[int]]
+    seconds: float
+    statistics: dict[str, Any]
+    arrays: dict[str, np.ndarray] = field(repr=False)
+
+    @property
+    def count(self) -> int:
+        """Number of passes."""
+        return sum(end - start for start, end in self.passes)
+
+    def variance(self) -> np.ndarray | None:
+        """Variance of the picture, height × width × channels; None with one pass."""
+        return mean_and_variance(self.arrays, self.count)[1] if self.count > 1 else None
+
+    def layer_sums(self) -> dict[str, np.ndarray]:
+        """The sums of layers; see ``layered``."""
+        return {name: self.arrays[name] for name in _OPTIONAL if name in self.arrays}
+
+    def layers(self) -> dict[str, np.ndarray]:
+        """The layers that were asked for; see ``layered.develop``."""
+        sums = self.layer_sums()
+        if not sums:
+            return {}
+        names = parse(self.identity['parameter "layers"'])
+        return develop(names, sums, self.count, self.film["filter"])
+
+    def save(self, path: Path) -> None:
+        """Write atomically, down to the disk. Raises ``output.OutputError``."""
+        header = asdict(self)
+        del header["arrays"]
+        header = output.plain(header) | {"format": "aniso_pm state", "version": VERSION}
+        header["sha256"] = _checksum(header, self.arrays)
+        entries: dict[str, Any] = {"header": np.array(json.dumps(header, ensure_ascii=False))}
+        entries |= self.arrays
+        with output.replacing(path) as partial, open(partial, "wb") as file:
+            np.savez(file, **entries)
+
+    @staticmethod
+    def load(path: Path) -> State:
+        """Read and verify. Raises StateError in one sentence, FileNotFoundError if it is absent."""
+        data = Path(path).read_bytes()
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+                header = json.loads(str(archive["header"]))
+                there = [name for name in _OPTIONAL if name in archive]
+                arrays = {name: archive[name] for name in (*_ARRAYS, *there)}
+            version, checksum = header["version"], header.pop("sha256")
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+            raise StateError(
+                f"{path}: not a whole state file ({reason}); delete it to start afresh"
+            ) from error
+        if version != VERSION:
+            raise StateError(f"{path}: state format {version}; this version reads {VERSION}")
+        if checksum != _checksum(header, arrays):
+            raise StateError(f"{path}: checksum mismatch, damaged; delete it to start afresh")
+        kept = ("identity", "film", "passes", "seconds", "statistics")
+        return State(**{name: header[name] for name in kept}, arrays=arrays)
+
+    def check_same(self, identity: dict[str, Any], name: Any) -> None:
+        """Raise StateError naming what differs unless this state's passes are passes of
+        ``identity``."""
+        found = differences(self.identity, identity)
+        if found:
+            more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+            raise StateError(f"{name}: belongs to another rendering: {'; '.join(found[:4])}{more}")
+
+
+def merge(states: dict[str, State]) -> State:
+    """One state of all passes; ``states`` by the names to call them in messages.
+
+    Raises StateError if they belong to different renderings or share a pass.
+    """
+    (first_name, first), *others = states.items()
+    passes = list(first.passes)
+    arrays = dict(first.arrays)
+    statistics, seconds = first.statistics, first.seconds
+    for name, state in others:
+        state.check_same(first.identity, f"{name} and {first_name}")
+        common = next((n for n in numbers(state.passes) if _holds(passes, n)), None)
+        if common is not None:
+            raise StateError(f"{name}: pass {common} is already in the states before it")
+        passes += state.passes
+        arrays = {k: v + state.arrays[k] for k, v in arrays.items()}
+        statistics = add_counts(statistics, state.statistics)
+        seconds += state.seconds
+    return State(first.identity, first.film, joined(passes), seconds, statistics, arrays)
+
+
+def numbers(passes):
+    """All pass numbers of half-open ranges."""
+    return (n for start, end in passes for n in range(start, end))
+
+
+def extended(passes: list[list[int]], number: int) -> list[list[int]]:
+    """The ranges with one more pass."""
+    return joined([*passes, [number, number + 1]])
+
+
+def missing(passes, first: int, count: int) -> list[list[int]]:
+    """Ranges of those passes from ``first`` to ``first + count - 1`` that are not in ``passes``."""
+    found, at = [], first
+    for start, end in [*joined(passes), [first + count, first + count]]:
+        if start > at:
+            found.append([at, min(start, first + count)])
+        at = max(at, end)
+    return [[a, b] for a, b in found if a < b]
+
+
+def describe(passes) -> str:
+    """ "0-7, 16-23": ranges of pass numbers for people."""
+    return ", ".join(f"{a}-{b - 1}" if b - a > 1 else f"{a}" for a, b in passes) or "none"
+
+
+def add_counts(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+    """Statistics over both: counts and seconds add up, everything else is that of ``b``."""
+    result = a | b
+    for name, value in b.items():
+        if isinstance(value, dict):
+            result[name] = add_counts(a.get(name, {}), value)
+        elif type(value) in (int, float) and name not in _NOT_ADDITIVE:
+            result[name] = a.get(name, 0) + value
+    return result
+
+
+_NOT_ADDITIVE = ("initial_radius", "radius", "photon_count", "relative_error")
+
+
+def _holds(passes, number: int) -> bool:
+    return any(start <= number < end for start, end in passes)
+
+
+def joined(passes) -> list[list[int]]:
+    """Disjoint ranges in order, those that touch as one."""
+    result: list[list[int]] = []
+    for start, end in sorted(map(list, passes)):
+        if result and result[-1][1] == start:
+            result[-1][1] = end
+        else:
+            result.append([start, end])
+    return result
+
+
+def _checksum(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
+    sha = hashlib.sha256(json.dumps(header, sort_keys=True, ensure_ascii=False).encode())
+    for name in (*_ARRAYS, *(name for name in _OPTIONAL if name in arrays)):
+        array = np.ascontiguousarray(arrays[name])
+        sha.update(f"{name} {array.dtype} {array.shape}".encode())
+        sha.update(array.data)
+    return sha.hexdigest()
+
+
+@dataclass
+class Checkpoint:
+    """Where and how often a rendering keeps its state.
+
+    path     the state file.
+    every    seconds between two writes (and never more than a twentieth of the time is spent on
+             writing); the state is also written at the end and after an interruption.
+    resume   start from the file if it is there.
+    on_write  called after each write but the last, e.g. to write the picture so far: the film
+              holds it.
+    """
+
+    path: Path
+    every: float = 30.0
+    resume: bool = False
+    on_write: Callable[[], Any] | None = None
+
+    def __post_init__(self):
+        self._written = time.perf_counter()
+        self._cost = 0.0
+
+    def start(self) -> State | None:
+        """The state to go on from, if that is wanted and there is one."""
+        self._written = time.perf_counter()
+        if not self.resume:
+            return None
+        try:
+            return State.load(self.path)
+        except FileNotFoundError:
+            return None
+
+    def due(self) -> bool:
+        return time.perf_counter() - self._written > max(self.every, 20 * self._cost)
+
+    def write(self, state: State) -> None:
+        began = time.perf_counter()
+        state.save(self.path)
+        self._written = time.perf_counter()
+        self._cost = self._written - began

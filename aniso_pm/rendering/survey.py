@@ -1,0 +1,309 @@
+"""What pairs of eye paths tell before the first pass: how the map is best used, how many of them
+should gather, how many light paths they are worth, how wide kernels should be, and which pixels
+need more samples.
+
+How variances become decisions is told in ``plan``.
+
+*Use of the map.* Where it is open (``Prepared.undecided``), the eye paths of the pilot go on as in
+path tracing and tell apart what each use leaves to them (see ``eye.Parts``). The use of the least
+
+    bias² + (A/n + B/N) (n P (C + q C_g) + N C_p) / (M n P C_0)
+
+is chosen, its error after the work of M passes of path tracing, C_0 for each path. Path tracing
+finds some caustics by rare hits that a pilot may miss, so that their variance seems small; it is
+chosen only where it has found the caustics that the map holds, by many hits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .. import arrays
+from ..map.gather_points import take
+from ..map.photon_map import PhotonMap, caustics
+from ..map.spectra import channel_mean
+from ..transport import aim, eye
+from . import footprint
+from .allotment import LEAST
+from .film import noise_share, rays_through, wavelengths
+from .plan import (
+    LEAST_SHARE,
+    LEFT,
+    LIGHT_PATH,
+    NARROW,
+    PASSES,
+    STRATIFIED,
+    WIDE,
+    Found,
+    Plan,
+    within,
+)
+from .prepared import PILOT, Prepared, stream_seed
+from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
+
+# Work of an eye path: of its first ray, of a vertex.
+_CAMERA, _VERTEX = 0.3, 0.4
+# Work of a pass that is not to be exceeded where passes may have any length: a third of a second.
+_LONGEST = 1.5e6
+# Another use of the map than "global" has to promise an error smaller by so much.
+_BETTER = 0.9
+# Path tracing has found the caustics if it has so much of their light, by as many hits.
+_FOUND, _HITS = 0.7, 64
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What was found.
+
+    use          of the map (see ``eye``).
+    errors       relative MSE that each use promises, by its name, where there was a choice; None
+                 where path tracing has not found what the map holds.
+    each         eye samples of a pixel in a pass, in the mean: fewer than asked for where light
+                 paths would make a pass too long.
+    share        of the eye paths of each pixel that should gather (see ``eye.Thinning``).
+    light_paths  of a pass; 0 where photons do not show.
+    counts       samples of each pixel (see ``allotment``), or None: all alike.
+    widths       of the kernels of each pixel, in pixels.
+    aim          of light paths (aim.Learned), or None: they begin evenly.
+    map, points  a map of that use, and where eye paths read it (GatherPoints); None where none do.
+    """
+
+    use: str
+    errors: dict[str, float | None]
+    each: int
+    share: np.ndarray
+    light_paths: float
+    counts: np.ndarray | None
+    widths: np.ndarray
+    aim: aim.Learned | None
+    map: PhotonMap | None
+    points: Any
+
+
+def look(
+    scene: Prepared, sensor, radius, seed: int, each: int, exactly: bool, maps, light_paths
+) -> Survey:
+    """Trace the pairs, and decide.
+
+    scene        where the use of the map is open: with ``chosen`` "survey".
+    radius       bandwidth of the first pass, world units, if it is given: all kernels have it.
+    each, exactly  see ``pilot.settle``.
+    maps         two independent photon maps of as many light paths, or empty ones.
+    light_paths  of a pass if they are given, else 0 or None.
+    """
+    tiles = Tiles.of(sensor, COARSE)
+    seen = _trace(scene, sensor, tiles, seed)
+    read = partial(_read, scene, sensor, radius, seed, tiles)
+    filtered = noise_share(sensor.film())
+    longest = math.inf if exactly or scene.settings.passes else _LONGEST
+    # What uses are compared after: the work of path tracing, whatever the length of their passes.
+    total = PASSES * each * tiles.pixels * float(seen.work.mean())
+    given = radius is None, light_paths, filtered, total, seen.work
+    decide = partial(Plan.of, longest, each, tiles, *given)
+    if seen.points is None or not min(map_.stored for map_ in maps):
+        use = scene.use
+        if use == "survey":
+            use = "none" if scene.photons_are_dispensable else "caustic"
+        light = seen.own + seen.later + (0 if use == "caustic" else seen.caustic)
+        weight = tiles.weight(light)
+        plan = decide(use, weight, within(light, light, weight))
+        return _survey(plan, {}, pixel_counts(plan, scene, sensor, seed), None, None)
+    own = seen.own
+    weigh = lambda gathered: tiles.weight(own + gathered)  # noqa: E731
+    if scene.use != "survey":
+        found = read(maps, seen.points, weigh)
+        weight = weigh(found.light)
+        plan = decide(scene.use, weight, within(own, own, weight), found)
+        return _survey(plan, {}, pixel_counts(plan, scene, sensor, seed), maps[0], seen.points)
+
+    # --- The global map ---
+    first = take(seen.points, dr.compress(~seen.points.caustic))
+    found = read(maps, first, weigh)
+    weight = weigh(found.light)
+    v_own = within(own, own, weight)
+    best = decide("global", weight, v_own, found, work=seen.early)
+    errors: dict[str, float | None] = {"global": best.error}
+    chosen, limit = (maps[0], first), _BETTER * best.error
+
+    # --- The other ones, unless their eye paths alone are too dear ---
+    light = own + seen.later
+    more = within(light, light, weight) - v_own
+    bare = decide("none", weight, v_own, later=more)
+    if bare.error < limit:
+        maps = [caustics(map_) for map_ in maps]
+        any_ = replace(seen.points, caustic=dr.full(mi.Bool, False, dr.width(seen.points.lane)))
+        found = read(maps, any_, lambda _: weight)
+        plan = decide("caustic", weight, v_own, found, later=more)
+        errors["caustic"] = plan.error
+        if plan.error < limit:
+            best, chosen, limit = plan, (maps[0], any_), plan.error
+        if scene.photons_are_dispensable:
+            errors["none"] = None
+            if _has_found(seen.caustic, found.light, weight):
+                light = light + seen.caustic
+                more = within(light, light, weight) - v_own
+                plan = decide("none", weight, v_own, later=more)
+                errors["none"] = plan.error
+                if plan.error < limit:
+                    best, chosen = plan, (None, None)
+    return _survey(best, errors, pixel_counts(best, scene, sensor, seed), *chosen)
+
+
+def _survey(plan: Plan, errors, counts, map_, points) -> Survey:
+    share, widths = (
+        plan.tiles.to_pixels(plan.tiles.grid(v)) if v.size > 1 else v
+        for v in (plan.share, plan.widths)
+    )
+    return Survey(
+        plan.use,
+        errors,
+        plan.each,
+        share,
+        plan.light_paths,
+        counts,
+        widths,
+        plan.aim,
+        map_,
+        points,
+    )
+
+
+def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray | None:
+    """Samples of each pixel: where they differ most is a matter of a few pixels, so that many eye
+    paths look, and nothing is gathered."""
+    if plan.each * LEAST < 1:
+        return None
+    fine, coarse = Tiles.of(sensor, FINE), plan.tiles
+    sampler, ray, lane = _pairs(sensor, fine, seed, 5)
+    # Kernels as those of the passes, which leave gather points.
+    scene = replace(scene, chosen=plan.use, footprint=footprint.of(sensor, 1.0))
+    few = dr.full(mi.Float, LEAST_SHARE, fine.lanes)
+    thinning = eye.Thinning.of(few, seed, lane, lane) if plan.share.min() < 1 else None
+    L, _, _ = scene.trace(sampler, ray, thinning=thinning)
+    own = _pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
+    weight = fine.weight(own + coarse.refined(plan.gathered, fine)[:, None])
+    noise = STRATIFIED * within(own, own, weight) + coarse.refined(plan.noise, fine)
+    work = coarse.refined(smooth(coarse.grid(plan.path_work)).ravel(), fine)
+    return fine.counts(noise, work, plan.each)
+
+
+def _pairs(sensor, tiles: Tiles, seed: int, stream: int):
+    """(sampler, rays, lanes) of the pairs of all tiles."""
+    sampler = mi.load_dict({"type": "owen_sobol"})
+    lane = dr.arange(mi.UInt32, tiles.lanes)
+    sampler.begin(stream_seed(seed, PILOT, stream), lane // SAMPLES, lane % SAMPLES)
+    ray, _ = rays_through(sensor, sampler, tiles.positions(sensor, seed, sampler), 0.5)
+    return sampler, ray, lane
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the pairs of eye paths saw, as (pairs, 2) but work, early (pairs).
+
+    own      light that every use leaves to eye paths.
+    later    light that the global map has, the caustic one not.
+    caustic  light that both have.
+    work     of the whole path; early: of the path up to its first gathered part.
+    points   where they gather, or None.
+    """
+
+    own: np.ndarray
+    later: np.ndarray
+    caustic: np.ndarray
+    work: np.ndarray
+    early: np.ndarray
+    points: Any
+
+
+def _trace(scene: Prepared, sensor, tiles: Tiles, seed: int) -> _Seen:
+    sampler, ray, _ = _pairs(sensor, tiles, seed, 3)
+    scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
+    vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
+
+    def see(lane, depth, si, bsdf, bs, active, scattered):
+        dr.scatter_add(vertices, mi.Float(1), lane, active)
+        dr.scatter_add(early, mi.Float(1), lane, active & ~scattered)
+
+    room = 3 * tiles.lanes if scene.use == "survey" else 0
+    L, _, points = scene.trace(sampler, ray, room, see=see)
+    later = caustic = mi.Float(0)
+    if isinstance(L, eye.Parts):
+        L, later, caustic = L.radiance, L.later, L.caustic
+    none = dr.zeros(mi.Float, tiles.lanes)
+    later, caustic = _pairwise(later + none), _pairwise(caustic + none)
+    own = _pairwise(channel_mean(L) + none) - later
+    work, early = (_VERTEX * _pairwise(v).mean(1) + _CAMERA for v in (vertices, early))
+    return _Seen(own, later, caustic, work, early, points)
+
+
+def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points, weigh) -> Found:
+    """weigh: pairs of gathered light → weight of each pair."""
+    colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
+    lanes = tiles.lanes
+    found: list[Any] = []
+    for width in (NARROW, WIDE) if not radius else (1.0, 1.0):
+        size = radius
+        if not radius:  # kernels as wide as they are told to be
+            size = 0.1 * scene.extent
+            free = footprint.of(sensor, size, width)
+            free = replace(free, least=dr.opaque(mi.Float, 1e-6))
+            scene = replace(scene, footprint=free)
+        scores: list[Any] = [None, None]
+        if found:
+            weight = weigh(0.5 * (found[0][0][0] + found[0][1][0]))
+            weight = arrays.own(mi.Float, np.repeat(weight, 2 * SAMPLES).astype(np.float32))
+            scores = [(dr.zeros(mi.Float, max(map_.stored, 1)), weight) for map_ in maps]
+        gather = partial(_gathered, scene, size, seed, points, colours, lanes)
+        found.append([gather(*each) for each in zip(maps, scores, strict=True)])
+    (a, met), (b, _) = found[0]
+    (wide_a, _), (wide_b, _) = found[1]
+    each = dr.width(points.lane) / lanes
+    learned = _learned(maps, [column for column, _ in scores])
+    return Found(a, b, wide_a, wide_b, met, each, maps[0].emitted, maps[0].stored, learned)
+
+
+def _learned(maps, columns) -> aim.Learned | None:
+    """How light paths should be aimed, from the scores of the photons of two maps."""
+    scores, left = [], []
+    for map_, column in zip(maps, columns, strict=True):
+        if not map_.stored:
+            return None
+        path, score = map_.origins.path.numpy(), np.nan_to_num(column.numpy(), posinf=0)
+        scores.append(np.bincount(path, score, map_.emitted))
+        left.append(np.bincount(path, minlength=map_.emitted))
+    photons_left = np.array(left, np.float64)
+    work = LIGHT_PATH + LEFT * photons_left
+    numbers = np.stack([map_.origins.numbers for map_ in maps])
+    return aim.learn(numbers, np.array(scores), work, photons_left)
+
+
+def _has_found(caustic, light, weight) -> bool:
+    """Have eye paths found the caustics of the map, by enough hits?"""
+    root = np.sqrt(weight)[:, None]
+    hits, there = (caustic * root).ravel(), float((light * root).mean())
+    squares = float((hits**2).sum())
+    enough = squares == 0 or float(hits.sum()) ** 2 >= _HITS * squares
+    return enough and float(hits.mean()) >= _FOUND * there
+
+
+def _gathered(scene, radius, seed, points, colours, lanes, map_, scores):
+    """(light of pairs, photons an eye path meets)."""
+    light, met = dr.zeros(mi.Float, lanes), 0.0
+    r = dr.opaque(mi.Float, radius)
+    for found in scene.gather(map_, r, seed, points, colours, scores) if map_.stored else ():
+        dr.scatter_add(light, channel_mean(found.radiance), found.lane)
+        met += float(dr.sum(mi.Float(found.photons))[0]) / lanes
+    return _pairwise(light), met
+
+
+def _pairwise(values) -> np.ndarray:
+    """Means over SAMPLES lanes, (pairs, 2), finite, double precision."""
+    values = np.nan_to_num(values.numpy().astype(np.float64), posinf=0, neginf=0)
+    return values.reshape(-1, 2, SAMPLES).mean(-1)
