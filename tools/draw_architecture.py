@@ -5,12 +5,13 @@ python tools/draw_architecture.py
 
 import sys
 import textwrap
-import tomllib
 from pathlib import Path
 
 import grimp
 import matplotlib
+import tomllib
 
+matplotlib.rcParams["svg.fonttype"] = "none"
 matplotlib.rcParams["svg.hashsalt"] = "architecture"  # the same file for the same imports
 from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.patches import FancyBboxPatch  # noqa: E402
