@@ -33,7 +33,11 @@ class AnisoPhotonMapper:
        - |string|
        - ``anisotropic``: where an eye path reaches a diffuse surface over an anisotropic glossy
          one, the density-estimation kernel follows the reflection lobe. ``isotropic``: discs
-         everywhere, the conventional photon mapper. (Default: ``anisotropic``)
+         everywhere, the conventional photon mapper. ``auto``: anisotropic, unless a pilot finds
+         that kernels behind lobes make less than a tenth of the error, so that following lobes
+         cannot pay for itself; with ``photon_count``, ``initial_radius`` or ``size`` given it is always
+         anisotropic.
+         (Default: ``auto``)
 
      * - rule
        - |string|

@@ -76,8 +76,13 @@ def test_a_readable_part_does_not_hide_an_unreadable_one():
 
 
 def test_evidence_names_shape_and_nested_bsdfs():
-    found = findings("brushed conductor")
-    assert found["anisotropic lobes"].evidence == ["plate: TwoSidedBRDF(RoughConductor)"]
+    plate = "plate: TwoSidedBRDF(RoughConductor)"
+    found = findings("brushed conductor", kernel="anisotropic")
+    assert found["anisotropic lobes"].needed and found["anisotropic lobes"].evidence == [plate]
+    found = findings("brushed conductor")  # near by, nothing would be gained
+    assert not found["anisotropic lobes"].needed
+    why, surface = found["anisotropic lobes"].evidence
+    assert why.startswith("kernel=auto: kernels behind lobes make ") and surface == plate
     found = findings("brushed conductor", kernel="isotropic")
     assert not found["anisotropic lobes"].needed
     assert found["anisotropic lobes"].evidence == ["parameter kernel=isotropic"]

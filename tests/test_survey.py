@@ -3,11 +3,12 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from aniso_pm.instruments import gallery
 from aniso_pm.rendering import pilot, plan
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.tiles import SAMPLES, Tiles
-from rooms import room, room_with_ball
+from rooms import room, room_with_ball, room_with_plate
 
 
 def settled(definition, each=16, **settings):
@@ -41,6 +42,23 @@ def test_more_samples_ask_for_more_light_paths(variant_llvm_rgb):
     """More than in proportion: kernels shrink as there are more of them."""
     few, many = (settled(room_with_ball(size=24), each, map="global")[0] for each in (128, 512))
     assert many.count > 3.5 * few.count
+
+
+def test_lobes_are_followed_where_kernels_behind_them_matter(variant_llvm_rgb):
+    """Far from metal that reflects fine light, and not in a small room with a plate."""
+
+    def follows(scene, **settings):
+        prepared = prepare(scene, Settings(**settings), False)
+        found = pilot.settle(prepared, scene.sensors()[0], 0, 16)
+        assert 0 <= found.lobes <= 1
+        return found.applied(prepared).follow_lobes
+
+    wall = mi.load_file(str(gallery.directory() / "brushed_wall.xml"), width="80", height="60")
+    near = mi.load_dict(room_with_plate(size=24))
+    assert follows(wall) and not follows(near)
+    for asked in ({"kernel": "anisotropic"}, {"photon_count": 10**5}, {"initial_radius": 0.05}):
+        assert follows(near, map="global", **asked), asked
+    assert not follows(wall, kernel="isotropic")
 
 
 def test_kernels_are_wide_where_light_is_smooth_and_narrow_at_an_edge():

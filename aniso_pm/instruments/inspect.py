@@ -30,10 +30,13 @@ def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
     """All decisions that were taken for a scene and its integrator's parameters. Where there is a
     map a pilot is traced through the scene's first sensor, as before a rendering. compile_: say
     what is compiled, too."""
-    scene, why_map, why_aim = decided(scene)
+    scene, why_map, why_aim, of_lobes = decided(scene)
     needs, settings = scene.needs, scene.settings
     shown = scene.follow_lobes
-    why_disc = "parameter kernel=isotropic" if settings.kernel == "isotropic" else "none found"
+    why_disc = ["parameter kernel=isotropic" if settings.kernel == "isotropic" else "none found"]
+    if not scene.lobes_matter and needs.lobes:
+        why_disc = [f"kernel=auto: kernels behind lobes make {of_lobes:.0%} of the error"]
+        why_disc += needs.lobes
     mirrors = [e for e in needs.chains if e not in needs.general] or needs.chains
     emitters = [emitter_name(e) for e in scene.scene.emitters()]
     spectrum = f"{dr.size_v(mi.Spectrum)} channels of the variant {mi.variant()}"
@@ -58,7 +61,7 @@ def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
             f"lobes are followed, kernels by rule={settings.rule}"
             if shown
             else "all kernels discs",
-            needs.lobes if shown else [why_disc],
+            needs.lobes if shown else why_disc,
         ),
         Finding(
             "unreadable roughness",
@@ -175,12 +178,12 @@ def kernels(scene: Prepared) -> Finding:
     return Finding("kernels", True, f"{number} kernels, {operations:,} operations", evidence)
 
 
-def decided(scene: Prepared) -> tuple[Prepared, list[str], str]:
-    """The scene as a pilot has decided, what ``map=auto`` went by, and why light paths are aimed
-    or not."""
+def decided(scene: Prepared) -> tuple[Prepared, list[str], str, float]:
+    """The scene as a pilot has decided, what ``map=auto`` went by, why light paths are aimed or
+    not, and the part of the error that kernels behind lobes make."""
     if not scene.needs_map:
         causes = ["nothing casts caustics"] if scene.settings.map == "auto" else []
-        return scene, [f"map=auto: {cause}" for cause in causes], "there are no light paths"
+        return scene, [f"map=auto: {cause}" for cause in causes], "there are no light paths", 0.0
     sensor = scene.scene.sensors()[0]
     spp, pixels = sensor.sampler().sample_count(), pixel_count(sensor.film())
     found = settle(scene, sensor, 0, shares(scene.settings, spp, pixels).each)
@@ -190,7 +193,8 @@ def decided(scene: Prepared) -> tuple[Prepared, list[str], str]:
     elif scene.settings.map == "auto" and scene.needs.unseen:
         why = [f"map=auto: light of {emitter}" for emitter in scene.needs.unseen[:1]]
     count = scene.settings.photon_count
-    return found.applied(scene).with_(photon_count=count), why, _aimed(found.aim)
+    scene = found.applied(scene).with_(photon_count=count)
+    return scene, why, _aimed(found.aim), found.lobes
 
 
 def _aimed(found) -> str:

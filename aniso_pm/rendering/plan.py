@@ -64,13 +64,14 @@ _LATER_STRATIFIED = 0.85
 @dataclass(frozen=True)
 class Found:
     """What a use of the map gives to the pairs: light from map a, b through narrow kernels and
-    through wide ones, (pairs, 2); photons that an eye path meets, gather points that it leaves;
-    light paths and photons of a map; how to aim those."""
+    through wide ones, what came over lobes of a, (pairs, 2); photons that an eye path meets, gather
+    points that it leaves; light paths and photons of a map; how to aim those."""
 
     a: np.ndarray
     b: np.ndarray
     wide_a: np.ndarray
     wide_b: np.ndarray
+    over_lobes: np.ndarray
     met: float
     points: float
     emitted: int
@@ -86,7 +87,8 @@ class Found:
 class Plan:
     """The best that can be done with a use of the map; see the module's head and ``Survey``. share
     and widths are those of tiles, error is the relative MSE, work that of a pass; path_work (of an
-    eye path), gathered (light) and noise (variance of gathers) are those of pairs."""
+    eye path), gathered (light) and noise (variance of gathers) are those of pairs; lobes is the
+    part of the error that kernels make which follow lobes."""
 
     tiles: Tiles
     use: str
@@ -100,6 +102,7 @@ class Plan:
     gathered: np.ndarray
     noise: np.ndarray
     aim: aim.Learned | None = None
+    lobes: float = 0.0
 
     @staticmethod
     def of(longest: float, each: int, *given, **more) -> Plan:
@@ -198,8 +201,13 @@ class Plan:
                 costs = (eye_work + gather) / (light * tiles.pixels)
                 paths = max(each * tiles.pixels * math.sqrt(by_photons * costs / eye_noise), 1.0)
         pass_ = each * tiles.pixels * (eye_work + gather) + paths * light
-        error = (eye_noise / each + by_photons / paths) * pass_ / total
-        error += _bias2(float(np.mean(change * (widths / NARROW) ** 3))) if choose else 0.0
+        noise_left = pass_ / total
+        error = (eye_noise / each + by_photons / paths) * noise_left
+        blur = change * (widths / NARROW) ** 3 if choose else np.zeros(len(whole))
+        error += _bias2(float(blur.mean()))
+        follow = np.clip(found.over_lobes.sum(1) / np.maximum(a.sum(1), 1e-30), 0, 1)
+        behind = max(0.0, float((follow * b_1 / widths**2).mean())) / paths * noise_left
+        behind += _bias2(float((follow * blur).mean()))
         noise = (v_gather + v_alone * thinner) / (filtered * share)
         return Plan(
             tiles,
@@ -214,6 +222,7 @@ class Plan:
             found.light.mean(1),
             noise,
             found.aim,
+            behind / max(error, 1e-30),
         )
 
 

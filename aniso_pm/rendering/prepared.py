@@ -67,6 +67,7 @@ class Prepared:
     footprint: Footprint | None = None  # of pixels; None: one bandwidth for all of a pass
     chosen: str | None = None  # use of the map that a pilot has found best, see ``undecided``
     aim: Aim | None = None  # of light paths, if a pilot has found that it pays
+    lobes_matter: bool = True  # kernels that follow lobes: a pilot may find that they do not
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -93,7 +94,16 @@ class Prepared:
     @property
     def follow_lobes(self) -> bool:
         """Keep the reflection lobes of eye paths?"""
-        return self.settings.kernel == "anisotropic" and len(self.needs.lobes) > 0
+        matter = self.settings.kernel != "isotropic" and self.lobes_matter
+        return matter and len(self.needs.lobes) > 0
+
+    @property
+    def lobes_are_dispensable(self) -> bool:
+        """May a pilot choose discs everywhere? Not where somebody says how many photons, or how
+        large kernels are to be."""
+        s = self.settings
+        asked = s.photon_count or s.initial_radius or s.size == "epsilon"
+        return s.kernel == "auto" and not asked
 
     @property
     def deep(self) -> bool:

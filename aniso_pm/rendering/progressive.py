@@ -171,6 +171,7 @@ class Run:
             self.identity = digest.identity(self.scene, self.sensor, self.seed, self.shares.text)
             self.identity |= {
                 "use of the map": use,
+                "lobes followed": self.scene.follow_lobes,
                 "initial radius": self.radius0,
                 "photon count": count,
                 "samples per pixel of a pass": self.shares.each,
@@ -184,6 +185,8 @@ class Run:
             "aim": found.aim and found.aim.gains(),
             "map": use,
             "map_errors": found.errors,
+            "kernel": "anisotropic" if self.scene.follow_lobes else "isotropic",
+            "error_behind_lobes": found.lobes,
             "memory_estimate": self.plan.bytes / memory.GIB,
             "wavefront_light_paths": self.plan.light_paths,
             "wavefront_eye_samples": self.plan.eye_samples,

@@ -17,7 +17,7 @@ class Settings:
     """Validated parameters, in Mitsuba's own names. Raises ValueError for a value out of range and
     TypeError for one of the wrong type; the message names parameter, value and accepted range."""
 
-    kernel: str = "anisotropic"
+    kernel: str = "auto"
     rule: str = "lobe"
     size: str = "bandwidth"
     epsilon: float = 0.02
@@ -52,7 +52,7 @@ class Settings:
                     f'aniso_pm: parameter "{field.name}" must be of type {name}, '
                     f"got {value!r} ({type(value).__name__})"
                 )
-        self._one_of("kernel", "anisotropic", "isotropic")
+        self._one_of("kernel", "auto", "anisotropic", "isotropic")
         self._one_of("rule", *RULES)
         self._one_of("size", "bandwidth", "epsilon")
         self._between("epsilon", 1e-8, 10)

@@ -72,6 +72,7 @@ class Survey:
     counts       samples of each pixel (see ``allotment``), or None: all alike.
     widths       of the kernels of each pixel, in pixels.
     aim          of light paths (aim.Learned), or None: they begin evenly.
+    lobes        part of the error that kernels make which follow lobes.
     map, points  a map of that use, and where eye paths read it (GatherPoints); None where none do.
     """
 
@@ -83,6 +84,7 @@ class Survey:
     counts: np.ndarray | None
     widths: np.ndarray
     aim: aim.Learned | None
+    lobes: float
     map: PhotonMap | None
     points: Any
 
@@ -170,6 +172,7 @@ def _survey(plan: Plan, errors, counts, map_, points) -> Survey:
         counts,
         widths,
         plan.aim,
+        plan.lobes,
         map_,
         points,
     )
@@ -262,11 +265,12 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
             scores = [(dr.zeros(mi.Float, max(map_.stored, 1)), weight) for map_ in maps]
         gather = partial(_gathered, scene, size, seed, points, colours, lanes)
         found.append([gather(*each) for each in zip(maps, scores, strict=True)])
-    (a, met), (b, _) = found[0]
-    (wide_a, _), (wide_b, _) = found[1]
+    (a, over_lobes, met), (b, _, _) = found[0]
+    (wide_a, _, _), (wide_b, _, _) = found[1]
     each = dr.width(points.lane) / lanes
     learned = _learned(maps, [column for column, _ in scores])
-    return Found(a, b, wide_a, wide_b, met, each, maps[0].emitted, maps[0].stored, learned)
+    emitted, stored = maps[0].emitted, maps[0].stored
+    return Found(a, b, wide_a, wide_b, over_lobes, met, each, emitted, stored, learned)
 
 
 def _learned(maps, columns) -> aim.Learned | None:
@@ -294,13 +298,15 @@ def _has_found(caustic, light, weight) -> bool:
 
 
 def _gathered(scene, radius, seed, points, colours, lanes, map_, scores):
-    """(light of pairs, photons an eye path meets)."""
-    light, met = dr.zeros(mi.Float, lanes), 0.0
+    """(light of pairs, the part of it that has come over lobes, photons an eye path meets)."""
+    light, over_lobes, met = dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes), 0.0
     r = dr.opaque(mi.Float, radius)
     for found in scene.gather(map_, r, seed, points, colours, scores) if map_.stored else ():
-        dr.scatter_add(light, channel_mean(found.radiance), found.lane)
+        radiance = channel_mean(found.radiance)
+        dr.scatter_add(light, radiance, found.lane)
+        dr.scatter_add(over_lobes, radiance, found.lane, found.follows)
         met += float(dr.sum(mi.Float(found.photons))[0]) / lanes
-    return _pairwise(light), met
+    return _pairwise(light), _pairwise(over_lobes), met
 
 
 def _pairwise(values) -> np.ndarray:

@@ -76,7 +76,8 @@ def explain(
         settled = settle(prepared, sensor, seed, each)
     radius0 = settled.radius
     # Photon by photon, so that those that are shown are those that are summed.
-    prepared = settled.applied(prepared).with_(gather_tolerance=0.0)
+    # Lobes are shown where rendering leaves them out, too (``kernel=auto``).
+    prepared = replace(settled.applied(prepared), lobes_matter=True).with_(gather_tolerance=0.0)
     if not settings.initial_radius:
         width = settled.widths.reshape(film.sampled_size(sensor.film())[::-1])
         border = (width.shape[1] - sensor.film().crop_size().x) // 2

@@ -19,7 +19,7 @@ def _fallbacks(name, rule) -> Measured:
     """Share of all gather points in which any fallback acted."""
     path = gallery.directory() / f"{name}.xml"
     scene = mi.load_file(str(path), width="96", height="72")
-    integrator = mi.load_dict({"type": "aniso_pm", "rule": rule})
+    integrator = mi.load_dict({"type": "aniso_pm", "kernel": "anisotropic", "rule": rule})
     image = np.array(mi.render(scene, integrator=integrator, spp=16))
     counts = integrator.statistics
     points = counts["gather_points"]
