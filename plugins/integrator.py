@@ -34,10 +34,9 @@ class AnisoPhotonMapper:
        - ``anisotropic``: where an eye path reaches a diffuse surface over an anisotropic glossy
          one, the density-estimation kernel follows the reflection lobe. ``isotropic``: discs
          everywhere, the conventional photon mapper. ``auto``: anisotropic, unless a pilot finds
-         that kernels behind lobes make less than a tenth of the error, so that following lobes
-         cannot pay for itself; with ``photon_count``, ``initial_radius`` or ``size`` given it is always
-         anisotropic.
-         (Default: ``auto``)
+         that kernels behind lobes make less than a third of the error, so that following lobes
+         would not pay for itself; with ``photon_count``, ``initial_radius`` or ``size`` given it is
+         always anisotropic. (Default: ``auto``)
 
      * - rule
        - |string|

@@ -37,6 +37,13 @@ def variants_all(request):
     yield from _use(request.param)
 
 
+def slow(*values):
+    """Of a list of parameters, those that only ``pytest -m slow`` takes."""
+    return [
+        pytest.param(*(v if isinstance(v, tuple) else (v,)), marks=pytest.mark.slow) for v in values
+    ]
+
+
 @pytest.fixture
 def ticking(monkeypatch):
     """As :func:`tick`, for one test."""

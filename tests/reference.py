@@ -16,6 +16,16 @@ import numpy as np
 
 # Conversions, and the references in 50 digits, are those of `aniso-pm stability`.
 from aniso_pm.instruments.stability.lanes import arr, f32, flt, unit, vec  # noqa: F401
+from aniso_pm.instruments.stability.reference import (  # noqa: F401
+    floats,
+    mp_cross,
+    mp_dot,
+    mp_geodesic_differences,
+    mp_log_g,
+    mp_taylor_axes,
+    mp_unit,
+    mp_vec,
+)
 
 # --- Between numpy, Dr.Jit and mpmath ------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from aniso_pm.rendering.film import rays_through
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.transport import aim
+from conftest import slow
 
 
 def learned(score, numbers=None, work=None, paths=40_000):
@@ -143,7 +144,14 @@ def found_in(name, seed=0, map_="global"):
     return world, prepared, settled
 
 
-@pytest.mark.parametrize("name", ["area", "point", "constant", "sunsky", "directional"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "area",
+        "sunsky",
+        *slow("point", "constant", "directional"),
+    ],
+)
 def test_the_same_light_arrives(variant_llvm_rgb, name):
     world, prepared, settled = found_in(name)
     assert settled.aim is not None and settled.aim.variance * settled.aim.work < 0.7

@@ -40,7 +40,9 @@ def scene():  # with more pixels than the pilot looks at
     )
 
 
-@pytest.mark.parametrize("more", [{}, {"map": "caustic"}, {"passes": 3}], ids=str)
+@pytest.mark.parametrize(
+    "more", [{}, pytest.param({"map": "caustic"}, marks=pytest.mark.slow), {"passes": 3}], ids=str
+)
 def test_other_seeds_compile_nothing(variant_llvm_rgb, more):
     scene_, plugin = scene(), mi.load_dict({"type": "aniso_pm", "map": "global"} | more)
     known = set()

@@ -10,6 +10,7 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import slow
 from energy import REFERENCE, indirect, region_means
 from rooms import ROOMS
 from rooms import room as empty_room
@@ -58,7 +59,7 @@ def test_indirect_light_agrees_with_path(room):
     assert_agrees(room, "lobe", -1, 200_000, 4, spp, range(6), tolerance)
 
 
-@pytest.mark.parametrize("depth", [1, 2, 3, 4])
+@pytest.mark.parametrize("depth", [2, 3, *slow(1, 4)])
 def test_max_depth_means_what_it_means_to_path(depth):
     assert_agrees("plate", "lobe", depth, 200_000, 2, 64, range(6), 0.03)
 
@@ -109,7 +110,7 @@ OBJECTS = {
     },
     "asgconductor": {"type": "asgconductor", "material": "Al", "alpha_u": 0.05, "alpha_v": 0.3},
 }
-OTHERS = sorted(OBJECTS.keys() - {"roughplastic", "mask", "bumped diffuse"})
+OTHERS = sorted(OBJECTS.keys() - {"roughplastic"})
 
 
 # One of each kind for every run of the tests. A conductor and a mixture show what instances do.
@@ -117,11 +118,9 @@ OTHERS = sorted(OBJECTS.keys() - {"roughplastic", "mask", "bumped diffuse"})
     "name, instanced",
     [
         ("roughplastic", False),
-        ("mask", False),
-        ("bumped diffuse", False),
         ("asgconductor", True),
-        *(pytest.param(name, False, marks=pytest.mark.slow) for name in OTHERS),
-        pytest.param("blend", True, marks=pytest.mark.slow),
+        *slow(*((name, False) for name in OTHERS)),
+        *slow(("blend", True)),
     ],
 )
 def test_indirect_light_agrees_with_path_around(name, instanced):
@@ -146,7 +145,14 @@ def assert_mean_agrees(scene, tolerance, spp=512, reference_spp=2048, reference=
     assert ours == pytest.approx(expected, rel=tolerance)
 
 
-@pytest.mark.parametrize("emitter", ["point", "spot", "directional", "constant", "sphere"])
+@pytest.mark.parametrize(
+    "emitter",
+    [
+        "point",
+        "sphere",
+        *slow("spot", "directional", "constant"),
+    ],
+)
 def test_every_kind_of_light_reaches_merged_walls(emitter):
     """Floor and wall share a BSDF, so Mitsuba merges them, and forgets how large they are."""
     T = mi.ScalarTransform4f
@@ -319,7 +325,13 @@ def test_kernel_normalisation_is_exact_on_a_curved_surface():
     assert np.array(image).mean() == pytest.approx(2, rel=0.01)
 
 
-@pytest.mark.parametrize("use", [{}, {"map": "caustic"}, {"final_gather": True}])
+@pytest.mark.parametrize(
+    "use",
+    [
+        {},
+        *slow({"map": "caustic"}, {"final_gather": True}),
+    ],
+)
 def test_a_mirror_that_sees_a_caustic_of_a_point_light(use):
     """Spot → mirror A → floor → mirror B → camera, which no path tracer finds. The light seems to
     come from the spot's image S' = (−2, 1, 0) behind A, so that the floor at p has the radiance

@@ -174,7 +174,9 @@ def test_the_wheel_works_without_the_sources(built, tmp_path):
     assert run_python(path + code, tmp_path).stdout.startswith(str(tmp_path))
 
     code = (
-        "from aniso_pm import cli, gallery; cli.main(['scenes', 'here']); print(gallery.__file__)"
+        "from aniso_pm import cli\n"
+        "from aniso_pm.instruments import gallery\n"
+        "cli.main(['scenes', 'here']); print(gallery.__file__)"
     )
     run = run_python(path + code, tmp_path)
     assert run.stdout.splitlines()[-1].startswith(str(tmp_path)), run.stderr

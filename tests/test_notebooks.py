@@ -20,7 +20,7 @@ def executed(path, attempts=2):
     for attempt in range(attempts):
         notebook = read(path)
         where = {"metadata": {"path": path.parent}}
-        client = NotebookClient(notebook, timeout=90, resources=where)
+        client = NotebookClient(notebook, timeout=60, resources=where)
         try:
             client.execute()
         except CellTimeoutError:

@@ -15,6 +15,7 @@ from aniso_pm.rendering.accumulate import Sums, mean_and_variance, relative_stan
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.state import Checkpoint, State
 from aniso_pm.rendering.stopping import Stopping
+from conftest import slow
 from passes import SMALL, close, integrator, load, render
 from rooms import room, room_with_ball
 
@@ -108,7 +109,7 @@ def test_automatic_photon_count_is_kept_when_resuming(tmp_path):
     assert plugin.statistics["photons_emitted"] == 3 * chosen + 1
 
 
-@pytest.mark.parametrize("parts", [(2, 2), (1, 3)])
+@pytest.mark.parametrize("parts", [(1, 3), pytest.param((2, 2), marks=pytest.mark.slow)])
 def test_passes_that_choose_everything_add_up_too(tmp_path, parts):
     """Resumed, with what a pilot chose for every pixel, and whatever their number was to be."""
     scene = mi.load_dict(room_with_ball(size=24))
@@ -408,7 +409,7 @@ def assert_replayed_right(name, use):
     return plugin.statistics["replayed"]
 
 
-@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("use", ["caustic", *slow(*(use for use in USES if use != "caustic"))])
 def test_replayed_passes_are_those_that_python_traces(use):
     assert assert_replayed_right("roughplastic floor under glass", use)
 

@@ -406,7 +406,7 @@ def small_room():
     return world, reference.make(world, world.sensors()[0], spp=8192)
 
 
-@pytest.mark.parametrize("dark", [1.0, 0.9])
+@pytest.mark.parametrize("dark", [0.9, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_dark_method_shows_in_energy_and_bias(small_room, monkeypatch, ticking, dark):
     """Kernels normalised to 0.9 lose a tenth of the indirect light, 3 % of all light here."""
     world, ref = small_room

@@ -181,6 +181,7 @@ def test_a_crash_and_a_hang_are_findings(monkeypatch):
         monkeypatch.undo()
 
 
+@pytest.mark.slow
 def test_a_short_soak_changes_no_picture():
     _, worst = soak.soak(renders=4, every=1, warm_up=2)
     assert worst < 1e-3  # the order of sums

@@ -1,6 +1,7 @@
 """States on disk: resumed, merged, refused by name where they belong to something else."""
 
 import json
+import shutil
 from pathlib import Path
 
 import aniso_pm  # noqa: F401
@@ -17,14 +18,21 @@ def _variant(variant_llvm_rgb):
     pass
 
 
-@pytest.fixture
-def states(tmp_path):
-    """Files with passes 0-1 and 2-3, and the picture of all four."""
-    scene = load()
-    paths = [tmp_path / "a.state", tmp_path / "b.state"]
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    mi.set_variant("llvm_ad_rgb")
+    scene, folder = load(), tmp_path_factory.mktemp("states")
+    paths = [folder / "a.state", folder / "b.state"]
     for path, first in zip(paths, (0, 2), strict=True):
         render(scene, integrator(passes=2), 4, 1, first, Checkpoint(path))
     return paths, scene, render(scene, integrator(passes=4), 8)
+
+
+@pytest.fixture
+def states(made, tmp_path):
+    """Files with passes 0-1 and 2-3, and the picture of all four."""
+    paths, scene, whole = made
+    return [Path(shutil.copy(path, tmp_path)) for path in paths], scene, whole
 
 
 def test_states_merge_into_the_picture_of_all_passes(states):

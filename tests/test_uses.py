@@ -11,6 +11,7 @@ from aniso_pm.rendering import pilot
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.tiles import Tiles
+from conftest import slow
 from rooms import room_with_ball
 
 
@@ -94,7 +95,10 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(
+    "scene",
+    ["room", *slow("plastic", "glass")],
+)
 def test_what_uses_leave_to_eye_paths_is_told_apart(variant_llvm_rgb, scene):
     """The parts add up to what eye paths of each use see, and all of them to path's picture."""
     scene = mi.load_dict(SCENES[scene]())
@@ -134,7 +138,10 @@ def test_what_uses_leave_to_eye_paths_is_told_apart(variant_llvm_rgb, scene):
     assert abs(float(np.mean(image)) - b) < 4 * 1.5 * error_b
 
 
-@pytest.mark.parametrize("chosen", ["global", "caustic", "none"])
+@pytest.mark.parametrize(
+    "chosen",
+    ["caustic", *slow("global", "none")],
+)
 def test_every_choice_gives_the_picture_of_path(variant_llvm_rgb, monkeypatch, chosen):
     from aniso_pm.rendering import progressive
 
