@@ -20,6 +20,7 @@ from aniso_pm.instruments.report import (
     make,
     methods,
     metrics,
+    page,
     reference,
     regions,
     runs,
@@ -493,3 +494,14 @@ def test_regions_lie_where_plate_and_caustic_are():
     assert ball["caustic"].sum() < 150
     assert ball["caustic"][36:46, 20:34].mean() > 0.2
     assert set(found(room(size=48))[0]) == {"whole"}
+
+
+def test_results_have_a_line_for_each_row_of_a_table():
+    made = {
+        "schema": 1,
+        "rows": [{"a": [1, 2], "b": "ü"}, {"a": []}],
+        "ratios": [],
+        "plan": {"x": 1},
+    }
+    text = page.as_json(made)
+    assert json.loads(text) == made and text.count("\n") == 9 and '  {"a": []}\n ]' in text

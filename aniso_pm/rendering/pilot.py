@@ -29,9 +29,9 @@ PHOTONS_PER_KERNEL = 60
 FEWEST, MOST = 10_000, 5_000_000
 # Light paths and eye paths of the pilot, and photons that a disc must hold to be measured.
 _PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
-# Lobes are followed where kernels behind them make so much of the error. They cost up to a seventh of
-# the time; where half of the error was theirs following them has saved a third of it, and less than
-# its cost where a fifth to three tenths were (docs/performance.md).
+# Lobes are followed where kernels behind them make so much of the error. They cost up to a seventh
+# of the time; where half of the error was theirs following them has saved a third of it, and less
+# than its cost where a fifth to three tenths were (docs/performance.md).
 WORTH_FOLLOWING = 1 / 3
 # Light paths for which the bandwidth is chosen before their number is.
 USUAL = 250_000

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,10 +55,21 @@ def write_figures(directory: Path, results, scene, panels) -> dict[str, Any]:
     return {"plots": shown, "panels": pictures}
 
 
+def as_json(results: dict[str, Any]) -> str:
+    """JSON in which each row of a table is a line, so that versions of a file can be compared."""
+    dumps = partial(json.dumps, ensure_ascii=False, allow_nan=False)
+    parts = []
+    for key, value in results.items():
+        text = dumps(value)
+        if isinstance(value, list) and value:
+            text = "[\n  " + ",\n  ".join(map(dumps, value)) + "\n ]"
+        parts.append(f" {dumps(key)}: {text}")
+    return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
 def write_page(directory: Path, results: dict[str, Any], figures: dict[str, Any]) -> Path:
     """Write ``results.json`` and ``index.html``. figures: scene → of :func:`write_figures`."""
-    text = json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False)
-    write(directory / "results.json", (text + "\n").encode())
+    write(directory / "results.json", as_json(results).encode())
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("aniso_pm.instruments.report", "."),
         autoescape=True,
