@@ -4,7 +4,9 @@ import aniso_pm  # noqa: F401  (before drjit, so that it can choose LLVM)  # iso
 import time
 
 import mitsuba as mi
+import numpy as np
 import pytest
+from aniso_pm.rendering.pilot import Settled
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral")
 
@@ -35,6 +37,27 @@ def variant_llvm_spectral():
 @pytest.fixture(params=VARIANTS)
 def variants_all(request):
     yield from _use(request.param)
+
+
+@pytest.fixture
+def without_pilot(request, monkeypatch):
+    """Plain choices where the pilot is not what a test is about: most of what such tests compile
+    would be the pilot's kernels. Tests marked ``with_pilot`` have one."""
+    if request.node.get_closest_marker("with_pilot"):
+        return
+
+    leave_out_the_pilot(monkeypatch)
+
+
+def leave_out_the_pilot(monkeypatch):
+    def settled(scene, sensor, seed, each, exactly=False):
+        use = "global" if scene.undecided else scene.use
+        count = scene.settings.photon_count or 10_000
+        radius = scene.settings.initial_radius or 0.02 * scene.extent
+        even = np.ones(1)
+        return Settled(use, {}, count, radius, each, even, None, even, None, 1.0)
+
+    monkeypatch.setattr("aniso_pm.rendering.progressive.settle", settled)
 
 
 def slow(*values):

@@ -17,6 +17,8 @@ from PIL import Image
 from rooms import room
 from test_cli import OURS, PATH, SCENE, assert_one_line, run  # noqa: F401 (fixture)
 
+pytestmark = pytest.mark.usefixtures("without_pilot")
+
 
 @pytest.fixture
 def without(monkeypatch):

@@ -8,6 +8,8 @@ import pytest
 from conftest import slow
 from rooms import room, room_with_plate
 
+pytestmark = pytest.mark.usefixtures("without_pilot")
+
 SMALL = {"type": "aniso_pm", "map": "global", "photon_count": 5000, "initial_radius": 0.1}
 
 
@@ -257,6 +259,7 @@ def test_statistics_of_an_earlier_render_do_not_survive_a_failure(scene):
     assert plugin.statistics.get("spp", 0) == 0
 
 
+@pytest.mark.with_pilot
 def test_later_passes_compile_nothing(scene):
     """The radius of a pass is data, not part of the kernels."""
     mi.render(scene, integrator=integrator(passes=2), spp=2)
@@ -269,6 +272,7 @@ def test_later_passes_compile_nothing(scene):
     assert len(misses) == 0, [(k["size"], k["operation_count"]) for k in misses]
 
 
+@pytest.mark.with_pilot
 def test_automatic_radius_scales_with_the_scene_and_the_photons(rgb):
     """Sixty photons a kernel, whatever the unit of length; √2 smaller with twice the photons."""
     radii = {}

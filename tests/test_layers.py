@@ -12,6 +12,8 @@ from aniso_pm.rendering.state import Checkpoint, State, merge
 from aniso_pm.transport import layers
 from rooms import room
 
+pytestmark = pytest.mark.usefixtures("without_pilot")
+
 ALL = ",".join(name for name in layers.NAMES if name != "standard_error")
 USES = {
     "none": {"map": "caustic"},

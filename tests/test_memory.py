@@ -17,6 +17,8 @@ from aniso_pm.rendering.state import Checkpoint
 from aniso_pm.transport import photons
 from rooms import room, room_with_ball, room_with_plate
 
+pytestmark = pytest.mark.usefixtures("without_pilot")
+
 GIB = memory.GIB
 SMALL = {"type": "aniso_pm", "map": "global", "photon_count": 40_000, "initial_radius": 0.1}
 

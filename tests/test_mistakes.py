@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from rooms import room, room_with_plate
 
+pytestmark = pytest.mark.usefixtures("without_pilot")
+
 
 @pytest.fixture(autouse=True)
 def _variant(variant_llvm_rgb):

@@ -19,6 +19,8 @@ from conftest import slow
 from passes import SMALL, close, integrator, load, render
 from rooms import room, room_with_ball
 
+pytestmark = pytest.mark.usefixtures("without_pilot")
+
 
 @pytest.fixture(autouse=True)
 def _variant(variant_llvm_rgb):
@@ -78,6 +80,7 @@ def test_samples_are_shared_evenly_and_open_ends_take_short_passes(parameters, s
     assert [shares(i) for i in range(len(each))] == each
 
 
+@pytest.mark.with_pilot
 def test_automatic_photon_count_balances_the_work_of_a_pass():
     """Twice the eye samples, twice the light paths, which are about as much work as eye paths in a
     room where both are as noisy."""
@@ -96,6 +99,7 @@ def test_automatic_photon_count_balances_the_work_of_a_pass():
     assert 1.9 < chosen[32] / chosen[16] < 2.6
 
 
+@pytest.mark.with_pilot
 def test_automatic_photon_count_is_kept_when_resuming(tmp_path):
     path = tmp_path / "a.state"
     scene = load(48)
@@ -109,6 +113,7 @@ def test_automatic_photon_count_is_kept_when_resuming(tmp_path):
     assert plugin.statistics["photons_emitted"] == 3 * chosen + 1
 
 
+@pytest.mark.with_pilot
 @pytest.mark.parametrize("parts", [(1, 3), pytest.param((2, 2), marks=pytest.mark.slow)])
 def test_passes_that_choose_everything_add_up_too(tmp_path, parts):
     """Resumed, with what a pilot chose for every pixel, and whatever their number was to be."""
@@ -342,6 +347,7 @@ def test_later_passes_cost_python_less_than_20_ms(name):
     assert plugin.statistics["replayed"] and typical < 0.02
 
 
+@pytest.mark.with_pilot
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.01, 1, 1000])
 def test_automatic_radius_suits_a_coin_and_a_stadium(scale):
@@ -414,6 +420,7 @@ def test_replayed_passes_are_those_that_python_traces(use):
     assert assert_replayed_right("roughplastic floor under glass", use)
 
 
+@pytest.mark.with_pilot
 def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
     """An error while Dr.Jit records costs time, not the picture; any other error is raised."""
 

@@ -9,8 +9,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm.rendering.state import Checkpoint, State, StateError, describe, merge
+from conftest import leave_out_the_pilot
 from passes import close, integrator, load, render
 from rooms import room, room_with_plate
+
+pytestmark = pytest.mark.usefixtures("without_pilot")
 
 
 @pytest.fixture(autouse=True)
@@ -23,9 +26,11 @@ def made(tmp_path_factory):
     mi.set_variant("llvm_ad_rgb")
     scene, folder = load(), tmp_path_factory.mktemp("states")
     paths = [folder / "a.state", folder / "b.state"]
-    for path, first in zip(paths, (0, 2), strict=True):
-        render(scene, integrator(passes=2), 4, 1, first, Checkpoint(path))
-    return paths, scene, render(scene, integrator(passes=4), 8)
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_the_pilot(patch)
+        for path, first in zip(paths, (0, 2), strict=True):
+            render(scene, integrator(passes=2), 4, 1, first, Checkpoint(path))
+        return paths, scene, render(scene, integrator(passes=4), 8)
 
 
 @pytest.fixture
@@ -61,6 +66,7 @@ def test_resuming_renders_the_missing_passes_only(states):
     assert seen == []
 
 
+@pytest.mark.with_pilot
 def test_resuming_keeps_the_bandwidth_that_the_pilot_chose(tmp_path):
     path = tmp_path / "a.state"
     scene = load()

@@ -30,8 +30,14 @@ class Figure:
 
 def figures(text: str) -> list[Figure]:
     """The rows of the table."""
-    row = re.compile(r"^\| (.+?) \| \[\w+\]\(([^)#]+)[^)]*\) \| `(.+?)` \| (\w{7,40}) \|$", re.M)
-    return [Figure(a, (TABLE.parent / b).resolve(), c, d) for a, b, c, d in row.findall(text)]
+    row = re.compile(r"^\| (.+?) \| (README|\[\w+\]\(.+?\)) \| `(.+?)` \| (\w{7,40}) \|$", re.M)
+    return [Figure(a, _file(b), c, d) for a, b, c, d in row.findall(text)]
+
+
+def _file(page: str) -> Path:
+    """Of ``README``, which has no link because the site leaves it out, or of a link."""
+    link = re.search(r"\(([^)#]+)", page)
+    return TABLE.parent / link[1] if link else ROOT / "README.md"
 
 
 def since(commit: str) -> list[str]:
