@@ -76,8 +76,10 @@ def explain(
         settled = settle(prepared, sensor, seed, each)
     radius0 = settled.radius
     # Photon by photon, so that those that are shown are those that are summed.
+    prepared = settled.applied(prepared).with_(gather_tolerance=0.0)
     # Lobes are shown where rendering leaves them out, too (``kernel=auto``).
-    prepared = replace(settled.applied(prepared), lobes_matter=True).with_(gather_tolerance=0.0)
+    left_out = not prepared.lobes_matter
+    prepared = replace(prepared, lobes_matter=True)
     if not settings.initial_radius:
         width = settled.widths.reshape(film.sampled_size(sensor.film())[::-1])
         border = (width.shape[1] - sensor.film().crop_size().x) // 2
@@ -154,7 +156,7 @@ def explain(
     return replace(
         found,
         sample=lane,
-        sentence=_sentence(found, kernel),
+        sentence=_sentence(kernel, left_out),
         path=vertices.path(lane, scene, depths[lanes == lane]),
         lobe=lobe,
         kernel=kernel,
@@ -402,9 +404,11 @@ def _why_kernel(prepared: Prepared, lobe, follows: bool, degenerate: bool) -> st
     return "disc (no anisotropic reflection lobe arrives here)"
 
 
-def _sentence(found: Explanation, kernel: Kernel) -> str:
+def _sentence(kernel: Kernel, left_out: bool) -> str:
     if kernel.follows_lobe:
-        return f"kernel of aspect {kernel.aspect:.2g} along an anisotropic lobe"
+        disc = ", instead of which kernel=auto takes the disc (see aniso-pm inspect)"
+        words = f"kernel of aspect {kernel.aspect:.2g} along an anisotropic lobe"
+        return words + disc * left_out
     return "isotropic kernel: " + kernel.why.removeprefix("disc ").strip("()")
 
 
