@@ -18,6 +18,8 @@ from aniso_pm.errors import one_line
 from aniso_pm.pictures.output import plain
 from aniso_pm.rendering.state import State
 
+pytestmark = pytest.mark.usefixtures("without_pilot")
+
 SCENE = """<scene version="3.0.0">
   <default name="spp" value="4"/>
   <default name="width" value="16"/>

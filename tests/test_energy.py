@@ -59,6 +59,7 @@ def test_indirect_light_agrees_with_path(room):
     assert_agrees(room, "lobe", -1, 200_000, 4, spp, range(6), tolerance)
 
 
+@pytest.mark.usefixtures("without_pilot")
 @pytest.mark.parametrize("depth", [2, 3, *slow(1, 4)])
 def test_max_depth_means_what_it_means_to_path(depth):
     assert_agrees("plate", "lobe", depth, 200_000, 2, 64, range(6), 0.03)
@@ -114,6 +115,7 @@ OTHERS = sorted(OBJECTS.keys() - {"roughplastic"})
 
 
 # One of each kind for every run of the tests. A conductor and a mixture show what instances do.
+@pytest.mark.usefixtures("without_pilot")
 @pytest.mark.parametrize(
     "name, instanced",
     [
@@ -145,6 +147,7 @@ def assert_mean_agrees(scene, tolerance, spp=512, reference_spp=2048, reference=
     assert ours == pytest.approx(expected, rel=tolerance)
 
 
+@pytest.mark.usefixtures("without_pilot")
 @pytest.mark.parametrize(
     "emitter",
     [
@@ -325,6 +328,7 @@ def test_kernel_normalisation_is_exact_on_a_curved_surface():
     assert np.array(image).mean() == pytest.approx(2, rel=0.01)
 
 
+@pytest.mark.usefixtures("without_pilot")
 @pytest.mark.parametrize(
     "use",
     [

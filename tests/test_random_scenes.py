@@ -22,6 +22,7 @@ def assert_nothing_is_found(kinds, tries, first_seed, spp):
 
 
 # Mirrored by their seeds: their normals are on both sides then.
+@pytest.mark.usefixtures("without_pilot")
 @pytest.mark.parametrize("kind, seed", [("rectangle", 1), ("cube", 4), ("thinlens", 0)])
 def test_indirect_light_agrees_with_path(kind, seed):
     assert_nothing_is_found([kind], 1, seed, 16)
