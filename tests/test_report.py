@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from aniso_pm import cli
 from aniso_pm.errors import InputError
+from aniso_pm.instruments import gallery
 from aniso_pm.instruments.report import (
     cells,
     denoised,
@@ -199,6 +200,14 @@ def test_films_are_boxed_whatever_filter_they_have(tmp_path):
         assert len(world.shapes()) == len(mi.load_file(str(file), optimize=False).shapes())
 
 
+def test_boxed_scenes_find_their_textures_from_anywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = [str(path) for path in mi.file_resolver()]
+    found = denoised.boxed(gallery.directory() / "teapot.xml", {"width": "16", "height": "12"})
+    assert pixel_weights(found.sensors()[0].film()) == [1.0]
+    assert [str(path) for path in mi.file_resolver()] == before
+
+
 def test_mitsubas_pictures_get_their_own_filter_back_after_denoising():
     """Calls are weighted by their samples; what is known beside a picture is as of ``aniso_pm``."""
     random = np.random.default_rng(0)
@@ -211,9 +220,8 @@ def test_mitsubas_pictures_get_their_own_filter_back_after_denoising():
     np.testing.assert_allclose(found["denoising_albedo"], truth[..., 3:6])
     np.testing.assert_allclose(found["denoising_normal"], truth[..., 6:])
     assert found["denoising_picture"].mean() == pytest.approx(2, abs=0.01)
+    assert "denoising_error" not in found
     # 840 samples of variance 1.
-    error = np.sqrt((found["denoising_error"] ** 2).mean())
-    assert error == pytest.approx(840**-0.5, rel=0.05)
     assert (found["denoising_picture"] - 2).std() == pytest.approx(840**-0.5, rel=0.15)
     assert (calls.picture - 2).std() < 0.6 * (found["denoising_picture"] - 2).std()
 

@@ -67,17 +67,19 @@ def test_resuming_renders_the_missing_passes_only(states):
 
 
 @pytest.mark.with_pilot
-def test_resuming_keeps_the_bandwidth_that_the_pilot_chose(tmp_path):
+def test_resuming_keeps_the_bandwidth_and_the_kernels_that_the_pilot_chose(tmp_path):
     path = tmp_path / "a.state"
     scene = load()
     render(scene, integrator(passes=2, initial_radius=0.0), 4, checkpoint=Checkpoint(path))
     state = State.load(path)
     chosen = state.identity["initial radius"]
-    state.identity["initial radius"] = 0.5 * chosen
+    assert state.identity["lobes followed"] and state.statistics["kernel"] == "anisotropic"
+    state.identity |= {"initial radius": 0.5 * chosen, "lobes followed": False}
     state.save(path)
     plugin = integrator(passes=3, initial_radius=0.0)
     render(scene, plugin, 6, checkpoint=Checkpoint(path, resume=True))
     assert plugin.statistics["initial_radius"] == 0.5 * chosen
+    assert plugin.statistics["kernel"] == "isotropic"
 
 
 def test_resuming_a_time_budget_counts_what_was_spent(tmp_path):

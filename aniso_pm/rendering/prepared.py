@@ -16,6 +16,7 @@ from ..map.gather_points import GatherPoints, map_tree, take
 from ..map.photon_map import EMPTY, PhotonMap, flux_bytes
 from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
+from ..transport.amends import repair_bounds
 from ..transport.split import split
 from .footprint import TRIED, Footprint
 from .needs import Needs, read_scene
@@ -420,7 +421,7 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
             f'aniso_pm: variant "{mi.variant()}" is not supported (photons carry no '
             "polarisation); choose llvm_ad_rgb or another unpolarized variant"
         )
-    _repair_bounds(scene)  # before light from outside is aimed at them
+    repair_bounds(scene)  # before light from outside is aimed at them
     try:
         needs = read_scene(scene, settings.gather_roughness)
         source = emission.prepare(scene) if scene.emitters() else None
@@ -434,25 +435,6 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
             f"large; give a length between {1e-7 * extent:g} and {10 * extent:g}, or 0 (automatic)"
         )
     return prepared
-
-
-def _repair_bounds(scene):
-    """Give every mesh its bounding box.
-
-    Mitsuba merges meshes that share a BSDF and leaves the merged one without a bounding box. The
-    scene then seems smaller than it is, or infinite: lights that surround the scene aim their
-    photons elsewhere and there is no extent to choose a bandwidth from.
-    """
-    broken = [shape for shape in scene.shapes() if not shape.bbox().valid()]
-    for shape in broken:
-        parameters = mi.traverse(shape)
-        if "vertex_positions" in parameters:
-            parameters.set_dirty("vertex_positions")
-            parameters.update()
-    if broken:
-        scene.parameters_changed()
-        for emitter in scene.emitters():
-            emitter.set_scene(scene)
 
 
 def stream_seed(seed: int, stream: int, index: int = 0) -> int:

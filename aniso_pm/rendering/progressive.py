@@ -151,6 +151,8 @@ class Run:
         self.radius0 = settings.initial_radius or known.get("initial radius") or found.radius
         self.found = found = replace(found, use=use, count=count, radius=self.radius0)
         self.scene = found.applied(self.scene)
+        follow = known.get("lobes followed", self.scene.follow_lobes)
+        self.scene = replace(self.scene, lobes_matter=follow)
         self.share = None  # of the eye paths of each pixel that gather; None: all do
         if found.share.min() < 1:
             pixels = films.pixel_count(self.film)

@@ -8,6 +8,7 @@
 * Emitters infinitely far away keep the bounding sphere that the scene had when it was loaded, so
   that after shapes have moved, light and shadow rays begin at a wrong distance. ``set_scene``
   tells them.
+* Meshes that Mitsuba has merged have no bounding box, which lights around the scene aim at.
 
 Nothing is done about emitters that do it right, whatever their version.
 """
@@ -107,3 +108,22 @@ def _area_now_over_then(emitter, shape) -> float:
     _, exitance = emitter.sample_wavelengths(si, mi.Float(0.5))
     then = dr.sum(flux)[0] / max(dr.sum(exitance)[0], 1e-30)
     return float(shape.surface_area()[0] / then) if then > 0 else 1.0
+
+
+def repair_bounds(scene):
+    """Give every mesh its bounding box.
+
+    Mitsuba merges meshes that share a BSDF and leaves the merged one without a bounding box. The
+    scene then seems smaller than it is, or infinite: lights that surround the scene aim their
+    photons elsewhere and there is no extent to choose a bandwidth from.
+    """
+    broken = [shape for shape in scene.shapes() if not shape.bbox().valid()]
+    for shape in broken:
+        parameters = mi.traverse(shape)
+        if "vertex_positions" in parameters:
+            parameters.set_dirty("vertex_positions")
+            parameters.update()
+    if broken:
+        scene.parameters_changed()
+        for emitter in scene.emitters():
+            emitter.set_scene(scene)

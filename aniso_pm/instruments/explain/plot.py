@@ -19,8 +19,7 @@ _KERNEL, _PHOTON, _LOBE, _MUTED = "#0072b2", "#d55e00", "#009e73", "0.55"
 
 
 def figure(found: Facts):
-    """A matplotlib figure: the lobe, and the receiver's plane with photons and kernel. Raises
-    ValueError where there is no kernel to draw; ImportError without matplotlib."""
+    """See ``explanation.Explanation.plot``."""
     from matplotlib.figure import Figure
 
     if found.kernel is None:

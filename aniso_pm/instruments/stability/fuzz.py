@@ -146,7 +146,7 @@ def random_scene(seed: int) -> tuple[dict, dict]:
     scene["sensor"]["film"]["rfilter"] = {"type": dice.one_of("box", "gaussian", "lanczos")}
     integrator = {
         "type": "aniso_pm",
-        "kernel": dice.one_of("anisotropic", "anisotropic", "isotropic"),
+        "kernel": dice.one_of("auto", "anisotropic", "isotropic"),
         "rule": dice.one_of(*RULES),
         "size": dice.one_of("bandwidth", "bandwidth", "epsilon"),
         "epsilon": dice.log(1e-8, 10),
