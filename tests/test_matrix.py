@@ -9,7 +9,6 @@ KNOWN = json.loads(matrix.REFERENCE.read_text())
 # One row of each kind for every run of the tests, each with one use of the map.
 QUICK = {
     "directionalarea, diffuse": "caustic",
-    "roughplastic 0.1": "final gather",
     "brushed principled": "global",
     "two brushed plates": "final gather",
 }
