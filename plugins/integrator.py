@@ -11,7 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm.rendering import progressive
-from aniso_pm.rendering.controls import Batch, Controls
+from aniso_pm.rendering.controls import Controls
+from aniso_pm.rendering.done import Batch
 from aniso_pm.rendering.film import pixel_weights as film_weights
 from aniso_pm.rendering.layered import develop
 from aniso_pm.rendering.pilot import USUAL, automatic_radius

@@ -57,7 +57,7 @@ def leave_out_the_pilot(monkeypatch):
         even = np.ones(1)
         return Settled(use, {}, count, radius, each, even, None, even, None, 1.0)
 
-    monkeypatch.setattr("aniso_pm.rendering.progressive.settle", settled)
+    monkeypatch.setattr("aniso_pm.rendering.beginning.settle", settled)
 
 
 def slow(*values):

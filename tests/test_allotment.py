@@ -69,7 +69,7 @@ def test_uneven_samples_converge_to_the_same_picture(variant_llvm_rgb, monkeypat
         def settled(*args):
             return replace(pilot.settle(*args), counts=counts)
 
-        monkeypatch.setattr("aniso_pm.rendering.progressive.settle", settled)
+        monkeypatch.setattr("aniso_pm.rendering.beginning.settle", settled)
         plugin = mi.load_dict(SMALL | {"passes": 2, "max_depth": 2})
         image = mi.render(scene, integrator=plugin, spp=2 * 64, seed=seed)
         return np.array(image, dtype=np.float64), plugin.statistics

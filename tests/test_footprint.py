@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm.rendering import footprint
-from aniso_pm.transport import eye
+from aniso_pm.transport.thinning import Thinning
 from rooms import room_with_ball
 
 
@@ -68,7 +68,7 @@ def test_of_a_pixels_samples_the_same_number_gathers(variant_llvm_rgb):
     lane = dr.arange(mi.UInt32, pixels * samples)
     for share in (0.125, 0.25, 0.6):
         each = dr.full(mi.Float, share, pixels)
-        chosen = eye.Thinning.of(each, 5, lane // samples, lane % samples).chosen().numpy()
+        chosen = Thinning.of(each, 5, lane // samples, lane % samples).chosen().numpy()
         chosen = chosen.reshape(pixels, samples)
         assert (abs(chosen.sum(1) - share * samples) < 2).all()
         # Each sample with the same chance: five standard deviations of 4096 draws.

@@ -10,7 +10,7 @@ import matrix
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.rendering import progress, progressive, schedule
+from aniso_pm.rendering import one_pass, progress, schedule
 from aniso_pm.rendering.accumulate import Sums, mean_and_variance, relative_standard_error
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.state import Checkpoint, State
@@ -434,7 +434,7 @@ def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
     assert plugin.statistics["replayed"] is False and plugin.statistics["passes"] == 3
     monkeypatch.undo()
     close(image, render(scene, integrator(passes=3), 6))
-    monkeypatch.setattr(progressive.films, "splat", fail)
+    monkeypatch.setattr(one_pass.films, "splat", fail)
     with pytest.raises(RuntimeError, match="cannot be recorded"):
         render(scene, integrator(passes=3), 6)
 

@@ -143,7 +143,7 @@ def test_what_uses_leave_to_eye_paths_is_told_apart(variant_llvm_rgb, scene):
     ["caustic", *slow("global", "none")],
 )
 def test_every_choice_gives_the_picture_of_path(variant_llvm_rgb, monkeypatch, chosen):
-    from aniso_pm.rendering import progressive
+    from aniso_pm.rendering import beginning
 
     scene = mi.load_dict(ball(SKY, PLASTIC))
 
@@ -151,7 +151,7 @@ def test_every_choice_gives_the_picture_of_path(variant_llvm_rgb, monkeypatch, c
         assert prepared.undecided
         return pilot.settle(replace(prepared, chosen=chosen), *args, **more)
 
-    monkeypatch.setattr(progressive, "settle", settle)
+    monkeypatch.setattr(beginning, "settle", settle)
     plugin = mi.load_dict({"type": "aniso_pm", "initial_radius": 0.03, "photon_count": 300_000})
     ours = [np.mean(mi.render(scene, integrator=plugin, spp=256, seed=s)) for s in range(4)]
     assert plugin.statistics["map"] == chosen

@@ -25,7 +25,7 @@ from typing import Any
 import mitsuba as mi
 from aniso_pm.errors import Failed, is_interrupt, one_line
 from aniso_pm.rendering import digest
-from aniso_pm.rendering.controls import Batch
+from aniso_pm.rendering.done import Batch
 from aniso_pm.rendering.progressive import Run
 
 from . import worker
@@ -90,7 +90,7 @@ class Elsewhere:
 
     def job(self, run: Run) -> worker.Job:
         """What workers have to know."""
-        scene = run.scene
+        scene = run.decided.scene
         return worker.Job(
             f"aniso_pm-{uuid.uuid4().hex[:12]}",
             self.parcel,
@@ -100,14 +100,14 @@ class Elsewhere:
             self.options.mixed,
             {
                 # As given: what was chosen is in ``settled``.
-                "settings": asdict(run.given),
+                "settings": asdict(run.given.settings),
                 "hide_emitters": scene.hide_emitters,
                 "sensor": self.sensor,
                 "seed": run.seed,
                 "spp": run.spp,
                 "first_pass": run.controls.first_pass,
-                "settled": worker.shrunk(run.found),
-                "variance": run.keeps_variance,
+                "settled": worker.shrunk(run.decided.settled),
+                "variance": run.decided.variance,
             },
         )
 
@@ -121,7 +121,7 @@ class _Dispatch:
         patience, keep = self.options.patience, self.options.keep
         self.crew = Crew(self.client, self.job, patience, keep, elsewhere.warn)
         self.pace = Pace(self.options.task_seconds, self.options.task_limit)
-        first, count = run.controls.first_pass, run.scene.settings.passes
+        first, count = run.controls.first_pass, run.given.settings.passes
         self.ledger = Ledger(first, count, run.done.passes)
         self.carriers: dict[str, _Carrier] = {}
         self.homing: _Carrier | None = None  # the sum of all, on its way home
@@ -212,7 +212,7 @@ class _Dispatch:
 
     def _seconds_left(self, workers: int) -> float:
         """For a task that begins when what was handed out is done."""
-        limit = self.run.scene.settings.time
+        limit = self.run.given.settings.time
         if not limit:
             return math.inf
         if self.began:
@@ -385,7 +385,7 @@ class _Dispatch:
         if (self.enough or self.ledger.left == 0) and all(c.done for c in self.carriers.values()):
             return True
         every, checkpoint = self.options.home_every, self.run.controls.checkpoint
-        if self.run.scene.settings.target_error or (checkpoint and checkpoint.due()):
+        if self.run.given.settings.target_error or (checkpoint and checkpoint.due()):
             every = min(every, max(_HOME_LEAST, self.home_cost / _HOME_SHARE))
         return time.monotonic() - self.home > every
 

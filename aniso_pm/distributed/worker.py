@@ -68,7 +68,7 @@ def join(job: Job) -> dict[str, Any]:
 
 
 def render(job: Job, passes: list[list[int]], task: str) -> dict[str, Any]:
-    """Render passes (half-open ranges). Returns them with their sums: see ``controls.Batch``.
+    """Render passes (half-open ranges). Returns them with their sums: see ``done.Batch``.
     Tells the client when it starts and ends."""
     worker = _Worker()
     with _rendering:

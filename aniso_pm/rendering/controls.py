@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .done import Batch
 from .pilot import Settled
 from .prepared import Prepared
 from .state import Checkpoint
@@ -40,22 +41,6 @@ class Controls:
     so_far: Callable[[Any, Any, int], None] | None = None
     settled: Settled | None = None
     elsewhere: Callable[[Run], Iterator[Batch]] | None = None
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Passes that were rendered together.
-
-    passes   half-open ranges of their numbers (see ``state.State``).
-    arrays   ``Sums.arrays()`` of them, and the sums of their layers.
-    counts   what they counted.
-    seconds  that each stage took.
-    """
-
-    passes: list[list[int]]
-    arrays: dict[str, np.ndarray]
-    counts: dict[str, int]
-    seconds: dict[str, float]
 
 
 @dataclass

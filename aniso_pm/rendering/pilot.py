@@ -54,12 +54,12 @@ def camera_rays(sensor, seed: int):
 class Settled:
     """What a rendering needs to know before its first pass, given or chosen.
 
-    use     of the map (see ``eye``).
+    use     of the map (see ``walk``).
     errors  relative MSE that each use promises, where there was a choice (see ``survey``).
     count   light paths per pass.
     radius  bandwidth of the first pass, world units.
     each    eye samples of a pixel in a pass (see ``survey``).
-    share   of the eye paths of each pixel that gather (see ``eye.Thinning``).
+    share   of the eye paths of each pixel that gather (see ``thinning``).
     counts  samples of each pixel in a pass (see ``allotment``), or None: all alike.
     widths  of the kernels of each pixel, in pixels (see ``footprint``).
     aim     of light paths (aim.Learned), or None: they begin evenly.

@@ -18,6 +18,8 @@ from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
 from ..transport.amends import repair_bounds
 from ..transport.split import split
+from ..transport.thinning import Thinning
+from ..transport.walk import WalkOptions
 from .footprint import TRIED, Footprint
 from .needs import Needs, read_scene
 from .settings import Settings
@@ -121,7 +123,7 @@ class Prepared:
 
     @property
     def use(self) -> str:
-        """How eye paths use the map; see ``eye``. As long as nobody has chosen, ``auto`` is
+        """How eye paths use the map; see ``walk``. As long as nobody has chosen, ``auto`` is
         "global" where there is anything to choose."""
         if self.chosen:
             return self.chosen
@@ -251,10 +253,10 @@ class Prepared:
         self, sampler, ray, expected: int = 0, see=None, thinning=None, for_layers: bool = False
     ):
         """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``, and
-        ``eye.eye_paths`` for ``see``, ``eye.Thinning``. for_layers: keep what layers need that are
+        ``walk`` for ``see``, and ``Thinning``. for_layers: keep what layers need that are
         asked for."""
         s = self.settings
-        options = eye.WalkOptions(
+        options = WalkOptions(
             self.use,
             s.depth_limit,
             s.rr_depth,
@@ -375,7 +377,7 @@ class Prepared:
         seed: int,
         expected: int = 0,
         lap=lambda stage: None,
-        thinning: eye.Thinning | None = None,
+        thinning: Thinning | None = None,
         for_layers: bool = False,
     ) -> Radiance:
         """Radiance along camera rays: their own share and the map's.

@@ -5,7 +5,7 @@ need more samples.
 How variances become decisions is told in ``plan``.
 
 *Use of the map.* Where it is open (``Prepared.undecided``), the eye paths of the pilot go on as in
-path tracing and tell apart what each use leaves to them (see ``eye.Parts``). The use of the least
+path tracing and tell apart what each use leaves to them (see ``apart``). The use of the least
 
     bias² + (A/n + B/N) (n P (C + q C_g) + N C_p) / (M n P C_0)
 
@@ -29,7 +29,9 @@ from .. import arrays
 from ..map.gather_points import take
 from ..map.photon_map import PhotonMap, caustics
 from ..map.spectra import channel_mean
-from ..transport import aim, eye
+from ..transport import aim
+from ..transport.apart import Parts
+from ..transport.thinning import Thinning
 from . import footprint
 from .allotment import LEAST
 from .film import noise_share, rays_through, wavelengths
@@ -62,12 +64,12 @@ _FOUND, _HITS = 0.7, 64
 class Survey:
     """What was found.
 
-    use          of the map (see ``eye``).
+    use          of the map (see ``walk``).
     errors       relative MSE that each use promises, by its name, where there was a choice; None
                  where path tracing has not found what the map holds.
     each         eye samples of a pixel in a pass, in the mean: fewer than asked for where light
                  paths would make a pass too long.
-    share        of the eye paths of each pixel that should gather (see ``eye.Thinning``).
+    share        of the eye paths of each pixel that should gather (see ``thinning``).
     light_paths  of a pass; 0 where photons do not show.
     counts       samples of each pixel (see ``allotment``), or None: all alike.
     widths       of the kernels of each pixel, in pixels.
@@ -188,7 +190,7 @@ def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray |
     # Kernels as those of the passes, which leave gather points.
     scene = replace(scene, chosen=plan.use, footprint=footprint.of(sensor, 1.0))
     few = dr.full(mi.Float, LEAST_SHARE, fine.lanes)
-    thinning = eye.Thinning.of(few, seed, lane, lane) if plan.share.min() < 1 else None
+    thinning = Thinning.of(few, seed, lane, lane) if plan.share.min() < 1 else None
     L, _, _ = scene.trace(sampler, ray, thinning=thinning)
     own = _pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
     weight = fine.weight(own + coarse.refined(plan.gathered, fine)[:, None])
@@ -237,7 +239,7 @@ def _trace(scene: Prepared, sensor, tiles: Tiles, seed: int) -> _Seen:
     room = 3 * tiles.lanes if scene.use == "survey" else 0
     L, _, points = scene.trace(sampler, ray, room, see=see)
     later = caustic = mi.Float(0)
-    if isinstance(L, eye.Parts):
+    if isinstance(L, Parts):
         L, later, caustic = L.radiance, L.later, L.caustic
     none = dr.zeros(mi.Float, tiles.lanes)
     later, caustic = _pairwise(later + none), _pairwise(caustic + none)

@@ -117,7 +117,7 @@ class Trail:
     def direct_light(self, use, bsdf, si, wo, value, f, roughness, scattered, active):
         """Light by emitter sampling at a vertex: ``value`` in all, with the BSDF's value f.
 
-        use, scattered  of the walk (see ``eye``): where paths go on with one part of a BSDF, a
+        use, scattered  of the walk (see ``walk``): where paths go on with one part of a BSDF, a
                         part that has not been chosen is not there.
         """
         if self.light is None:

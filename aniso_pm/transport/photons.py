@@ -14,10 +14,7 @@ Shading normals make light transport asymmetric. At a bounce the importance-tran
 receiver's cosine is that of the shading normal, while flux arrives per geometric area, so the
 photon carries the factor |wi·n_s| / |wi·n_g|.
 
-Bump and normal maps have a third normal, known to the BSDF alone, and directions that the viewer's
-side can see but sampling from the light's side never finds. There half of the smooth bounces are
-drawn from the cosine hemisphere, all are weighted by the BSDF as the viewer evaluates it, f(v, l)
-with v the direction in which light leaves, and delta bounces by the cosines to their own normal.
+At bump and normal maps the BSDF is weighted as the viewer evaluates it (see ``bent``).
 
 Light paths begin evenly over what emitters emit, or where they are told to (see ``aim``).
 
@@ -40,6 +37,7 @@ from ..map.photon_word import SEGMENTS_MAX, encode, encode_normal
 from ..map.receivers import gathered_part, read_bent, read_receiver
 from ..map.spectra import channel_mean
 from .aim import Aim
+from .bent import bent_bounce, viewed
 from .emission import Emission, only_photons_see
 from .rays import largest_coordinate, spawn_ray
 
@@ -190,21 +188,8 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
     reach = dr.opaque(mi.Float, largest_coordinate(scene))
 
-    # --- Leave the emitter ---
-    numbers = _first_numbers(sampler)
-    path = dr.arange(mi.UInt32, dr.width(numbers[0]))
-    worth = mi.Float(1)
-    if dr.hint(o.aim is not None, mode="scalar"):
-        # Stratified: path k of n chooses between k/n and (k + 1)/n.
-        share = dr.rcp(dr.opaque(mi.Float, dr.width(path)))
-        *numbers, worth = o.aim((mi.Float(path) + sampler.next_1d()) * share, *numbers)
-    ray, emitted, emitter = source.sample_ray(mi.Float(0), *numbers, wavelengths=o.wavelengths)
-    emitted *= worth
-    finite = dr.all(dr.isfinite(emitted))
+    ray, emitted, path, shortest, finite = _leave_emitter(source, sampler, o)
     reject(~finite)
-    shortest = mi.UInt32(2)  # Segments of the shortest path that is stored
-    if dr.hint(o.unseen_light, mode="scalar"):
-        shortest = dr.select(only_photons_see(emitter), mi.UInt32(1), mi.UInt32(2))
     ray = mi.Ray3f(ray)  # Current ray
     β = mi.Spectrum(1)  # Path throughput, shading-normal corrections included
     η = mi.Float(1)  # Relative index of refraction along the path
@@ -245,7 +230,7 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
         bent = mi.Bool(False)
         if dr.hint(o.bent, mode="scalar"):
             bent = read_bent(bsdf, active)
-            bs, bent_weight = _bent_bounce(ctx, bsdf, si, bs, weight, sampler, bent)
+            bs, bent_weight = bent_bounce(ctx, bsdf, si, bs, weight, sampler, bent)
             weight = dr.select(bent, bent_weight, weight)
         wo = si.to_world(bs.wo)
         wo_n, wo_s = dr.dot(wo, si.n), mi.Frame3f.cos_theta(bs.wo)
@@ -261,11 +246,7 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
             gathers = is_receiver
             if dr.hint(o.general, mode="scalar"):
                 mixed = is_receiver & ~lambertian
-                smooth = mixed & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-                viewed = _viewed(si, bs.wo)
-                f_g = gathered_part(bsdf, viewed, si.wi, o.roughness, smooth)
-                f = bsdf.eval(mi.BSDFContext(), viewed, si.wi, smooth)
-                g = mi.Spectrum(dr.select(smooth & (f > 0), dr.clip(f_g / f, 0, 1), 0))
+                g = _gathered_share(si, bsdf, bs, o.roughness, mixed)
                 chance = channel_mean(g)
                 gathers = is_receiver & (lambertian | (sampler.next_1d(active) < chance))
                 part = dr.select(gathers, g / chance, (1 - g) / (1 - chance))
@@ -287,35 +268,29 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
         depth += 1
 
 
-def _viewed(si, direction):
-    """The surface seen from another direction (local)."""
-    seen = mi.SurfaceInteraction3f(si)
-    seen.wi = direction
-    return seen
+def _leave_emitter(source, sampler, o):
+    """(ray, flux, number of the path, segments of the shortest path that is stored, is the flux
+    finite?) of every path."""
+    numbers = _first_numbers(sampler)
+    path = dr.arange(mi.UInt32, dr.width(numbers[0]))
+    worth = mi.Float(1)
+    if o.aim is not None:
+        # Stratified: path k of n chooses between k/n and (k + 1)/n.
+        share = dr.rcp(dr.opaque(mi.Float, dr.width(path)))
+        *numbers, worth = o.aim((mi.Float(path) + sampler.next_1d()) * share, *numbers)
+    ray, emitted, emitter = source.sample_ray(mi.Float(0), *numbers, wavelengths=o.wavelengths)
+    emitted *= worth
+    shortest = mi.UInt32(2)
+    if o.unseen_light:
+        shortest = dr.select(only_photons_see(emitter), mi.UInt32(1), mi.UInt32(2))
+    return ray, emitted, path, shortest, dr.all(dr.isfinite(emitted))
 
 
-def _bent_bounce(ctx, bsdf, si, bs, weight, sampler, active):
-    """(BSDF sample, f(v, l)/p or delta weight) at bump and normal maps, see the module's head."""
-    m = si.wi + bs.wo * bs.eta  # along the normal that a delta bounce knows
-    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    cosines = dr.abs(dr.dot(m, si.wi) / dr.dot(m, bs.wo))
-    cosines = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null), 1, cosines)
-
-    drawn = active & (sampler.next_1d(active) < 0.5)
-    cosine_wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d(active))
-    cosine_wo.z = dr.mulsign(cosine_wo.z, mi.Frame3f.cos_theta(si.wi))
-    bs = mi.BSDFSample3f(bs)
-    bs.wo = dr.select(drawn, cosine_wo, bs.wo)
-    bs.eta = dr.select(drawn, 1, bs.eta)
-    bs.sampled_type = dr.select(drawn, int(mi.BSDFFlags.DiffuseReflection), bs.sampled_type)
-
-    delta &= ~drawn
-    smooth = active & ~delta
-    same_side = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo) > 0
-    pdf = 0.5 * bsdf.pdf(ctx, si, bs.wo, smooth)
-    pdf += dr.select(same_side, 0.5 * dr.inv_pi * dr.abs(mi.Frame3f.cos_theta(bs.wo)), 0)
-    value = bsdf.eval(mi.BSDFContext(), _viewed(si, bs.wo), si.wi, smooth)
-    # A sample that failed is no sample of that density, wherever it points.
-    failed = ~drawn & dr.all(weight == 0)
-    value = dr.select((pdf > 0) & ~failed, value / pdf, 0)
-    return bs, dr.select(delta, 2 * weight * cosines, value)
+def _gathered_share(si, bsdf, bs, roughness, mixed):
+    """Share of the gathered part in the sampled direction, as the viewer sees it, 0 to 1 in each
+    channel; mixed: lanes whose BSDF may have both parts."""
+    smooth = mixed & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    seen = viewed(si, bs.wo)
+    f_g = gathered_part(bsdf, seen, si.wi, roughness, smooth)
+    f = bsdf.eval(mi.BSDFContext(), seen, si.wi, smooth)
+    return mi.Spectrum(dr.select(smooth & (f > 0), dr.clip(f_g / f, 0, 1), 0))

@@ -32,7 +32,7 @@ def split(
 ) -> Light:
     """``L``, which ``density.estimate`` has found with the other arguments, in parts.
 
-    use     of the map, see ``eye``.
+    use     of the map, see ``walk``.
     unseen  does the map hold light that came straight from an emitter?
     """
     later: Any = mi.Bool(False) if points.later is None else points.later

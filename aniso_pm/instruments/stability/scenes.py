@@ -13,7 +13,7 @@ from functools import cache, partial
 
 import mitsuba as mi
 import numpy as np
-from aniso_pm.rendering import progressive
+from aniso_pm.rendering import beginning
 from aniso_pm.transport import photons
 
 from .case import Case, Measured
@@ -208,12 +208,12 @@ def _film(width, height) -> Measured:
 
 @contextmanager
 def _wavefronts(photon_paths, eye_samples) -> Iterator[None]:
-    before = photons.WAVEFRONT, progressive.WAVEFRONT
-    photons.WAVEFRONT, progressive.WAVEFRONT = photon_paths, eye_samples
+    before = photons.WAVEFRONT, beginning.WAVEFRONT
+    photons.WAVEFRONT, beginning.WAVEFRONT = photon_paths, eye_samples
     try:
         yield
     finally:
-        photons.WAVEFRONT, progressive.WAVEFRONT = before
+        photons.WAVEFRONT, beginning.WAVEFRONT = before
 
 
 def _many_wavefronts(photon_paths, eye_samples) -> Measured:

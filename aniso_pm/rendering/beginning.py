@@ -1,0 +1,148 @@
+"""Before the first pass: what the pilot chooses, or an earlier run has chosen, and what follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import own
+from . import advice, digest, footprint, memory
+from . import film as films
+from .allotment import Allotment
+from .controls import Controls
+from .layered import Layered
+from .pilot import Settled, photons_per_path, settle
+from .prepared import Prepared
+from .schedule import Shares, shares
+
+# Eye samples traced at once, where there is memory for them (see ``memory``).
+WAVEFRONT = 1 << 21
+
+
+@dataclass(frozen=True)
+class Decided:
+    """What a rendering goes by in all of its passes.
+
+    scene      with all that was chosen for it.
+    settled    what that was.
+    shares     samples of each pass; allotment: of each pixel.
+    gathering  share of the eye paths of each pixel that gather (mi.Float); None: all do.
+    layered    layers that are summed, or None.
+    plan       wavefronts that fit into the memory.
+    variance   is the spread of passes kept?
+    replayed   passes are traced in Python once and then replayed.
+    """
+
+    scene: Prepared
+    settled: Settled
+    shares: Shares
+    allotment: Allotment
+    gathering: Any
+    layered: Layered | None
+    plan: memory.Plan
+    variance: bool
+    replayed: bool
+
+    @property
+    def wavefront(self) -> int:
+        """Most eye samples at once."""
+        room = max(self.allotment.pixels, WAVEFRONT // self.scene.crowding)
+        return min(room, self.plan.eye_samples)
+
+    def identity(self, sensor, seed: int) -> dict[str, Any]:
+        """What a state has to agree in, to be gone on from (see ``digest``)."""
+        return digest.identity(self.scene, sensor, seed, self.shares.text) | {
+            "use of the map": self.settled.use,
+            "lobes followed": self.scene.follow_lobes,
+            "initial radius": self.settled.radius,
+            "photon count": self.settled.count,
+            "samples per pixel of a pass": self.shares.each,
+        }
+
+    def statistics(self, given) -> dict[str, Any]:
+        """Those that are known before the first pass. given: the settings before the choice."""
+        settled = self.settled
+        return {
+            "initial_radius": settled.radius,
+            "radius_automatic": given.initial_radius == 0,
+            "share_of_gathers": float(settled.share.mean()),
+            "photon_count": settled.count,
+            "photon_count_automatic": given.photon_count == 0,
+            "aim": settled.aim and settled.aim.gains(),
+            "map": settled.use,
+            "map_errors": settled.errors,
+            "kernel": "anisotropic" if self.scene.follow_lobes else "isotropic",
+            "error_behind_lobes": settled.lobes,
+            "memory_estimate": self.plan.bytes / memory.GIB,
+            "wavefront_light_paths": self.plan.light_paths,
+            "wavefront_eye_samples": self.plan.eye_samples,
+            "replayed": self.replayed,
+        }
+
+
+def decide(
+    scene: Prepared, sensor, seed: int, spp: int, controls: Controls, known: dict[str, Any]
+) -> Decided:
+    """Run the pilot, and make ready for passes.
+
+    spp    as in ``progressive.render``.
+    known  identity of the earlier run that is gone on from; empty: there is none.
+
+    Raises ValueError where samples, layers or memory do not fit; for what reason it says.
+    """
+    film, settings = sensor.film(), scene.settings
+    pixels = films.pixel_count(film)
+    share = shares(settings, spp or sensor.sampler().sample_count(), pixels, controls.first_pass)
+    layered = Layered.of(film, settings.layer_names)
+    advice.before(scene)
+    film.prepare([])
+
+    # --- What is chosen ---
+    # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
+    exactly = known.get("samples per pixel of a pass")
+    each = exactly or share.each
+    settled = controls.settled or settle(scene, sensor, seed, each, bool(exactly))
+    settled = replace(
+        settled,
+        use=known.get("use of the map") or settled.use,
+        count=settings.photon_count or known.get("photon count") or settled.count,
+        radius=settings.initial_radius or known.get("initial radius") or settled.radius,
+    )
+    share = replace(share, each=settled.each)
+    scene = settled.applied(scene)
+    scene = replace(scene, lobes_matter=known.get("lobes followed", scene.follow_lobes))
+
+    # --- What follows ---
+    # Variances are worth their memory where there can be any, now or after a merge.
+    kept = controls.checkpoint is not None or controls.settled is not None
+    variance = kept or settings.passes != 1
+    plan = memory.plan(scene, *_job(scene, film, seed, share, layered, variance))
+    scene = replace(scene, light_wavefront=plan.light_paths)
+    if not settings.initial_radius:
+        pixel = footprint.of(sensor, settled.radius, settled.widths)
+        scene = replace(scene, footprint=pixel)
+    gathering = None
+    if settled.share.min() < 1:
+        gathering = own(mi.Float, np.resize(settled.share, pixels).astype(np.float32))
+    # The response curves of a specfilm do not survive a replay of the scene that they are in.
+    replayed = settings.passes != 1 and not mi.has_flag(film.flags(), mi.FilmFlags.Special)
+    allotment = Allotment(pixels, settled.each, settled.counts)
+    return Decided(scene, settled, share, allotment, gathering, layered, plan, variance, replayed)
+
+
+def _job(
+    scene: Prepared, film, seed: int, share: Shares, layered: Layered | None, variance: bool
+) -> tuple[memory.Job, Callable[[], float]]:
+    """What is to be held in memory, with a bound to the photons, and how to count those."""
+    s, pixels = scene.settings, films.pixel_count(film)
+    # Roulette ends paths with a chance of at least 1/20 a segment.
+    bound = min(s.depth_limit, s.rr_depth + 20) * s.photon_count if scene.needs_map else 0
+    most = share.each + bool(share.one_more)
+    at_once = max(1, min(most, WAVEFRONT // scene.crowding // pixels))
+    channels = film.create_block().channel_count() + (layered.channels if layered else 0)
+    job = memory.Job(bound, pixels, channels, variance, pixels * at_once)
+    return job, lambda: photons_per_path(scene, seed) * s.photon_count

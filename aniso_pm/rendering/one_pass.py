@@ -1,0 +1,167 @@
+"""One pass: its photons, its eye paths wavefront by wavefront, and what they leave in the film.
+
+Passes are pure: pass i depends on (scene, parameters, seed, i) alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import is_interrupt
+from ..map.photon_map import PhotonMap
+from ..transport.thinning import Thinning
+from . import film as films
+from .beginning import Decided
+from .clock import Clock
+from .done import COUNTS, Traced
+from .layered import plus
+from .prepared import EYE, PROBE, THINNING, stream_seed
+from .schedule import bandwidth, wavelength_sample
+
+
+class _Room:
+    """How many entries a buffer needs. It grows in steps: buffers of another size are traced anew
+    by what is frozen."""
+
+    def __init__(self):
+        self.room = self.most = 0
+
+    def seen(self, count: int):
+        self.most = max(self.most, count)
+        if count > self.room:
+            self.room = count + count // 8
+
+
+class Tracer:
+    """Renders one pass after the other.
+
+    map, radius  of the last one.
+    unfinished   wavefronts so far of the pass that is being rendered; None between passes.
+    replayed     are passes traced in Python once and then replayed?
+    photons      of a map, the most so far.
+    """
+
+    def __init__(self, decided: Decided, sensor, seed: int, clock: Clock):
+        self.decided, self.sensor, self.seed, self.clock = decided, sensor, seed, clock
+        self.replayed = decided.replayed
+        self.scene = decided.scene.frozen() if self.replayed else decided.scene
+        self.map: PhotonMap | None = None
+        self.radius: float | None = None
+        self.unfinished: Traced | None = None
+        self._photons, self._points = _Room(), _Room()
+
+    @property
+    def photons(self) -> int:
+        return self._photons.most
+
+    def __call__(self, index: int, report: Callable[[int, float], None]) -> Traced:
+        """Pass ``index``. report: called with it and the share of it that is done, after every
+        wavefront but the last."""
+        try:
+            return self._trace(index, report)
+        except RuntimeError as error:
+            # Dr.Jit cannot record every scene (materials written in Python, for example).
+            if is_interrupt(error) or not self.replayed:
+                raise
+            self.replayed, self.scene = False, self.scene.thawed()
+            return self._trace(index, report)
+
+    def _trace(self, index: int, report: Callable[[int, float], None]) -> Traced:
+        # --- Photons ---
+        self.unfinished = None
+        decided, settings = self.decided, self.scene.settings
+        self.radius = bandwidth(decided.settled.radius, settings.alpha, index)
+        colour = wavelength_sample(self.seed, index)
+        wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
+        self.map = self.scene.photon_map(
+            self.seed, index, self._photons.room, wavelengths, self.clock.lap
+        )
+        self._photons.seen(self.map.stored)
+        counts = dict.fromkeys(COUNTS, 0)
+        counts["photons_emitted"] = self.map.emitted
+        counts["photons_stored"] = self.map.stored
+        counts["photons_rejected"] = self.map.rejected
+
+        # --- Eye paths, where memory is short one sample each of a part of the pixels ---
+        spp = decided.shares(index)
+        allotment, layered = decided.allotment, decided.layered
+        more = spp - allotment.each
+        before = decided.shares.before(index) - index * allotment.each
+        # An array, not a number: as a literal it would make every pass compile kernels of its own.
+        radius = dr.opaque(mi.Float, self.radius)
+        image, layers = None, None
+        parts = allotment.wavefronts(index, more, before, decided.wavefront)
+        for wavefront, (lanes, done) in enumerate(parts):
+            random = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
+            image, found = self._wavefront(index, lanes, radius, random, colour, counts, image)
+            layers = plus(layers, found) if layered else None
+            self.clock.lap("film")
+            counts["spp"] = int(spp * done)
+            self.unfinished = Traced(image, dict(counts), layers)
+            if done < 1:
+                report(index, done)
+        counts["spp"] = spp
+        return Traced(image, counts, layers)
+
+    def _wavefront(self, index: int, lanes, radius, random, colour: float, counts, image):
+        """Some eye samples: (image with them, their sums of layers).
+
+        lanes   allotment.Lanes.
+        random  seed for density estimation.
+        colour  of the pass, see ``film.sample_rays``.
+        counts  are raised.
+        image   of the wavefronts before, or None.
+        """
+        decided, sensor, scene = self.decided, self.sensor, self.scene
+        film, each = sensor.film(), decided.allotment.each
+        sampler = mi.load_dict({"type": "owen_sobol"})
+        sampler.begin(stream_seed(self.seed, EYE), lanes.pixel, lanes.sample)
+        ray, ray_weight, position = films.sample_rays(sensor, sampler, lanes.pixel, colour)
+        dr.eval(ray, ray_weight, position)
+        thinning = None
+        if decided.gathering is not None:
+            choice = stream_seed(self.seed, THINNING)
+            thinning = Thinning.of(decided.gathering, choice, lanes.pixel, lanes.sample)
+
+        # --- Eye paths and density estimation ---
+        if scene.footprint is not None:
+            pixel = scene.footprint.in_pass(index).seen_by(lanes.pixel)
+            scene = replace(scene, footprint=pixel)
+        room, lap = self._points.room, self.clock.lap
+        seen = scene.radiance(sampler, ray, self.map, radius, random, room, lap, thinning, True)
+        self._points.seen(_count(seen.gathered, counts))
+
+        # --- Into the image ---
+        finite = dr.all(dr.isfinite(seen.L))
+        counts["eye_samples"] += lanes.count
+        counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
+        L = dr.select(finite, seen.L, 0) * ray_weight
+        splats = films.splat(film, position, L, seen.valid, each, ray.wavelengths, lanes.weight)
+        image = splats if image is None else image + splats
+        dr.eval(image)
+        layers: dict[str, Any] = {}
+        if decided.layered is not None:
+            layers = decided.layered.wavefront(
+                position, L, seen.seen, seen.gathered, ray, ray_weight, lanes, finite, each
+            )
+        return image, layers
+
+
+def _count(gathered, counts) -> int:
+    """Raises the counts by what was gathered; gather points of it."""
+    points = 0
+    for found in gathered:
+        points += dr.width(found.lane)
+        counts["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
+        counts["gather_points_clamped"] += int(dr.count(found.clamped)[0])
+        counts["gather_points_capped"] += int(dr.count(found.capped)[0])
+        counts["gather_points_degenerate"] += int(dr.count(found.degenerate)[0])
+        counts["gather_points_off_surface"] += int(dr.count(found.lost)[0])
+        counts["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
+    counts["gather_points"] += points
+    return points

@@ -1,0 +1,291 @@
+"""The walk of an eye path from vertex to vertex.
+
+A path is traced as Mitsuba's ``path`` does (emitter sampling and BSDF sampling, combined by the
+power heuristic). At a receiver the gathered part of its BSDF (see ``receivers``) leaves a gather
+point: what arrives there over two path segments or more is the photon map's. What is left for the
+path depends on how the map is used:
+
+global        the gathered part ends there, except for direct light; the walked part goes on.
+caustic       the map holds caustics alone: light → walked parts → gathered part. The path goes on
+              with both parts, and drops emission and direct light that reach a gathered part over
+              one walked part or more, because the map has them.
+final gather  "caustic" up to the first gathered part, "global" from there on.
+none          there is no map: path tracing.
+survey        "caustic", with what the other uses would have done told apart (see ``apart``): for
+              the pilot that chooses between them.
+
+Each light path is counted exactly once in all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from ..lobe_path import GlossyVertex, follow, no_lobe
+from ..map.receivers import gathered_part, read_receiver
+from ..map.spectra import channel_mean
+from . import layers
+from .apart import Apart
+from .rays import largest_coordinate, spawn_ray
+from .thinning import Thinning
+
+
+@dataclass  # not frozen: Dr.Jit writes back whatever a loop mentions
+class WalkOptions:
+    """Decisions for one scene; what is off is not traced.
+
+    use            see above.
+    max_depth      segments of the longest light path.
+    rr_depth       segments after which Russian roulette begins.
+    min_segments   segments of the shortest light path that the map holds (2; 1 where the scene has
+                   direct light that only the map knows).
+    hide_emitters  directly visible emitters are invisible.
+    gathers        there is a map to be read; without it no gather point is left.
+    follow_lobes   keep the anisotropic lobe of the last glossy vertex (``needs.lobes``).
+    deep           the scene has surfaces to walk on (``needs.chains``).
+    general        the scene has receivers that are not Lambertian (``needs.general``).
+    roughness      smallest alpha that is gathered on.
+    measure        keep the length of the path at gather points.
+    thinning       which paths leave gather points; None: all do.
+    light          split light by how it came (see ``layers``).
+    surface        keep what is seen.
+    """
+
+    use: str
+    max_depth: int
+    rr_depth: int
+    min_segments: int
+    hide_emitters: bool
+    gathers: bool
+    follow_lobes: bool
+    deep: bool
+    general: bool
+    roughness: float
+    measure: bool = False
+    thinning: Thinning | None = None
+    light: bool = False
+    surface: bool = False
+
+
+class Vertex(NamedTuple):
+    """A receiver that a path has met, as ``walk`` hands it to ``leave``.
+
+    lane        of the path; si: the vertex; ray: that arrived there.
+    weight      of what is gathered there (with the BRDF, where it is Lambertian).
+    depth       path segments from the camera.
+    path        GlossyVertex, where lobes are followed.
+    lambertian  is its BSDF?
+    scattered   has the path left a gathered part before?
+    distance    from the camera along the path, where that is measured.
+    """
+
+    lane: Any
+    si: Any
+    ray: Any
+    weight: Any
+    depth: Any
+    path: GlossyVertex | None
+    lambertian: Any
+    scattered: Any
+    distance: Any
+
+
+def first_lobe(o: WalkOptions) -> GlossyVertex | None:
+    """Of a path that leaves the camera."""
+    return no_lobe() if o.follow_lobes else None
+
+
+@dr.syntax
+def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
+    """(radiance, valid) of one wavefront of eye paths, as in ``eye.trace``.
+
+    leave  called as leave(Vertex, active) where paths leave gather points.
+    see    called as see(lane, depth, si, bsdf, bs, active, scattered) where paths scatter;
+           scattered: have they left a gathered part before?
+    """
+    ctx = mi.BSDFContext()
+    o = options
+    max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
+    reach = dr.opaque(mi.Float, largest_coordinate(scene))
+
+    ray = mi.Ray3f(ray)  # Current ray
+    lane = dr.arange(mi.UInt32, dr.width(ray))
+    depth = mi.UInt32(1)  # Path segments up to the vertex that is looked at
+    L = mi.Spectrum(0)  # Radiance so far
+    β = mi.Spectrum(1)  # Throughput of the path that goes on
+    β_direct = mi.Spectrum(1)  # Throughput of emission at the next vertex
+    η = mi.Float(1)  # Relative index of refraction along the path
+    active = mi.Bool(True)  # Lanes with a path to follow
+    valid = mi.Bool(not o.hide_emitters and scene.environment() is not None)  # Anything seen?
+    scattered = mi.Bool(False)  # Has the path left a gathered part? ("caustic", "final_gather")
+    si_prev = dr.zeros(mi.Interaction3f)  # Last vertex
+    pdf_prev = mi.Float(1)  # Density of the last BSDF sample
+    delta_prev = mi.Bool(True)  # Was it a delta distribution (or the camera)?
+    path = first_lobe(o)
+    distance = mi.Float(0)  # Length of the path
+    trail = layers.begin(o.light, o.surface)  # What it keeps for layers, if anybody asks
+    apart = Apart.begin() if o.use == "survey" else None  # What the survey tells apart
+    chosen, worth = mi.Bool(True), mi.Float(1)  # Does the path gather, and for how many others?
+    if dr.hint(o.thinning is not None, mode="scalar"):
+        chosen, worth = o.thinning.chosen(), dr.rcp(o.thinning.share)
+
+    while dr.hint(active, label="eye paths"):
+        # --- Find the next vertex ---
+        si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 1, active)
+        if dr.hint(o.hide_emitters, mode="scalar"):
+            si, ray = _skip_emitters(scene, ray, si, active & (depth == 1))
+
+        # --- Emission, weighted against emitter sampling at the last vertex ---
+        ds = mi.DirectionSample3f(scene, si, si_prev)
+        seen = active & (ds.emitter != None)  # noqa: E711 (a Dr.Jit comparison)
+        if dr.hint(o.hide_emitters, mode="scalar"):
+            # As path does: the environment appears once a surface has been seen.
+            seen &= valid | si.is_valid()
+        pdf_emitter = scene.pdf_emitter_direction(si_prev, ds, seen & ~delta_prev)
+        mis = dr.select(delta_prev, 1, _power_heuristic(pdf_prev, pdf_emitter))
+        emission = mis * ds.emitter.eval(si, seen)
+        L[seen] = dr.fma(β_direct, emission, L)
+        if dr.hint(trail is not None, mode="scalar"):
+            trail.emission(β_direct * emission, seen)
+        if dr.hint(apart is not None, mode="scalar"):
+            apart.emission(emission, β_direct, seen)
+        on_surface = active & si.is_valid()
+        active &= si.is_valid() & (depth < max_depth) & (dr.max(β) > 0)
+
+        # --- Direct light by emitter sampling ---
+        bsdf = si.bsdf(ray)
+        ds, light, wo, f, lit = _sample_light(scene, sampler, ctx, si, bsdf, β, active)
+        if dr.hint(o.use not in ("global", "none") and o.deep, mode="scalar"):
+            # Over a walked part to a gathered one: the map has it.
+            whole = f
+            f = dr.select(scattered, gathered_part(bsdf, si, wo, o.roughness, lit), f)
+            if dr.hint(apart is not None, mode="scalar"):
+                apart.direct_light(light, f, whole, lit & scattered)
+        L[lit] = dr.fma(f, light, L)
+        if dr.hint(trail is not None, mode="scalar"):
+            trail.direct_light(o.use, bsdf, si, wo, f * light, f, o.roughness, scattered, lit)
+
+        # --- Leave a gather point ---
+        is_receiver, lambertian, brdf = read_receiver(bsdf, si, o.roughness, o.general, active)
+        is_receiver &= active
+        weight = dr.select(lambertian, β * brdf, β)
+        here = is_receiver & (depth + o.min_segments <= max_depth)
+        finite = dr.all(dr.isfinite(weight))
+        here &= dr.max(weight) != 0
+        if dr.hint(o.follow_lobes, mode="scalar"):
+            path.distance += dr.select(active, si.t, 0)
+        if dr.hint(o.measure or o.surface, mode="scalar"):
+            distance += dr.select(active, si.t, 0)
+        if dr.hint(o.gathers, mode="scalar"):
+            L[here & ~finite] = dr.nan  # counted and dropped later
+            here &= chosen
+            weight *= worth
+            vertex = Vertex(lane, si, ray, weight, depth, path, lambertian, scattered, distance)
+            leave(vertex, here & finite)
+
+        # --- Sample the BSDF ---
+        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        if dr.hint(see is not None, mode="scalar"):
+            see(lane, depth, si, bsdf, bs, active, scattered)
+        g = _gathered_share(o, ctx, bsdf, si, bs, is_receiver, lambertian, delta)
+        if dr.hint(trail is not None, mode="scalar"):
+            trail.scatter(o.use, g, scattered)
+            solid = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+            trail.see(si, β * weight, distance, is_receiver, solid)
+        if dr.hint(o.follow_lobes, mode="scalar"):
+            path = follow(path, bsdf, si, ray, bs, active & ~(dr.min(g) == 1))
+        valid |= on_surface & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        ray = spawn_ray(si, si.to_world(bs.wo), reach)
+        β, β_direct, scattered = _go_on(o, sampler, β * weight, g, scattered, active, apart)
+        η *= bs.eta
+        si_prev = mi.Interaction3f(si)
+        pdf_prev = bs.pdf
+        delta_prev = delta
+        active &= (dr.max(β) > 0) | (dr.max(β_direct) > 0)
+
+        # --- Russian roulette, for paths that go on ---
+        if dr.hint(o.deep or o.use != "global", mode="scalar"):
+            survive = dr.minimum(dr.maximum(dr.max(β), dr.max(β_direct)) * η * η, 0.95)
+            roulette = (depth >= rr_depth) & (dr.max(β) > 0)
+            active &= ~roulette | (sampler.next_1d(active) < survive)
+            scale = dr.select(roulette, dr.rcp(survive), 1)
+            β *= scale
+            β_direct *= scale
+            if dr.hint(apart is not None, mode="scalar"):
+                apart.throughput *= scale
+        depth += 1
+    kept = layers.Seen(L, trail.light, trail.surface) if trail is not None else L
+    return (apart.parts(L) if apart is not None else kept), valid
+
+
+def _sample_light(scene, sampler, ctx, si, bsdf, β, active):
+    """One emitter, with the BSDF towards it: (its sample, β times what arrives from it, weighted
+    against BSDF sampling, local direction, BSDF's value with the cosine, lanes with such light)."""
+    lit = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    ds, light = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
+    lit &= ds.pdf != 0
+    wo = si.to_local(ds.d)
+    f, pdf = bsdf.eval_pdf(ctx, si, wo, lit)
+    light *= β * dr.select(ds.delta, 1, _power_heuristic(ds.pdf, pdf))
+    return ds, light, wo, f, lit
+
+
+def _gathered_share(o, ctx, bsdf, si, bs, is_receiver, lambertian, delta):
+    """Share of the gathered part in the sampled direction, 0 to 1 in each channel."""
+    g = dr.select(is_receiver, mi.Spectrum(1), mi.Spectrum(0))
+    if not o.general:
+        return g
+    mixed = is_receiver & ~lambertian
+    f_g = gathered_part(bsdf, si, bs.wo, o.roughness, mixed & ~delta)
+    f = bsdf.eval(ctx, si, bs.wo, mixed & ~delta)
+    share = dr.select(f > 0, dr.clip(f_g / f, 0, 1), 0)
+    # rounding leaves nothing to walk on
+    share = mi.Spectrum(dr.select(share > 1 - 1e-5, 1, share))
+    return dr.select(mixed, dr.select(delta, 0, share), g)
+
+
+def _go_on(o, sampler, β_both, g, scattered, active, apart):
+    """Which part of the BSDF the path goes on with: (throughput of the path, and of emission at the
+    next vertex, has it left a gathered part?).
+
+    β_both  throughput with both parts; g: share of the gathered one.
+    """
+    if o.use == "none":
+        # Not the same array: both are scaled in place.
+        return mi.Spectrum(β_both), β_both, scattered
+    if o.use == "global":
+        return β_both * (1 - g), β_both, scattered
+    # The path goes on with one of the parts, chosen by its share.
+    chance = channel_mean(g)
+    gathers = sampler.next_1d(active) < chance
+    β = β_both * dr.select(gathers, g / chance, (1 - g) / (1 - chance))
+    if o.use == "final_gather":
+        β = dr.select(scattered, β_both * (1 - g), β)
+    if apart is not None:
+        apart.scatter(β_both * (1 - g), scattered)
+    return β, dr.select(scattered, β_both * g, β_both), scattered | gathers
+
+
+def _power_heuristic(a, b):
+    """Veach's weight a²/(a² + b²) of a sample drawn with density a."""
+    return dr.select(dr.isfinite(a), dr.rcp(1 + dr.square(b / a)), 1)
+
+
+@dr.syntax
+def _skip_emitters(scene, ray, si, active):
+    """The first surface behind directly visible area lights (``hide_emitters``), and the ray that
+    finds it."""
+    ray = mi.Ray3f(ray)
+    active = active & si.is_valid()
+    active &= si.emitter(scene) != None  # noqa: E711
+    while active:
+        ray[active] = si.spawn_ray(ray.d)
+        si[active] = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        active &= si.emitter(scene) != None  # noqa: E711
+    return si, ray
