@@ -12,6 +12,7 @@ import OpenEXR
 import pytest
 from aniso_pm.errors import InputError
 from aniso_pm.pictures import denoising, display
+from aniso_pm.rendering.allotment import Allotment
 from aniso_pm.rendering.film import pixel_weights, splat
 from PIL import Image
 from rooms import room
@@ -118,13 +119,15 @@ def test_a_filter_over_whole_pixels_is_the_films(variant_llvm_rgb, name):
     assert sum(weights) == pytest.approx(1) and weights == pytest.approx(weights[::-1], abs=1e-6)
     assert (len(weights) == 1) == (name == "box")
     size, each = film.size(), 1024
-    pixel = dr.arange(mi.UInt32, size[0] * size[1] * each) // each
+    lanes = next(Allotment(size[0] * size[1], each).wavefronts(0, 0, 0, 1 << 30))[0]
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, dr.width(pixel))
-    column, row = pixel % size[0], pixel // size[0]
+    sampler.seed(0, lanes.count)
+    column, row = lanes.pixel % size[0], lanes.pixel // size[0]
     position = mi.Point2f(mi.Float(column), mi.Float(row)) + sampler.next_2d()
     bright = dr.select(column >= 10, mi.Float(1), mi.Float(0))
-    film.put_block(mi.ImageBlock(splat(film, position, mi.Color3f(bright), True, each, None)))
+    film.put_block(
+        mi.ImageBlock(splat(film, lanes, position, mi.Color3f(bright), mi.Bool(True), None))
+    )
     edge = np.zeros((6, 20, 3), np.float32)
     edge[:, 10:] = 1
     found = denoising.filtered_by(edge, weights)

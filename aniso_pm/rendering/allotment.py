@@ -26,18 +26,28 @@ LEAST, MOST = 0.25, 8.0
 
 @dataclass(frozen=True)
 class Lanes:
-    """One wavefront of eye samples, those of a pixel in consecutive lanes.
+    """One wavefront of eye samples: of ``pixels`` pixels from number ``first`` on, in this order.
 
     pixel   number of the pixel, row by row from the film's border on.
     sample  number of the sample in the sequence of its pixel.
     weight  with which it goes into the film; None: 1.
     count   lanes.
+    starts  first lane of each of the pixels, and ``count``; a number: so many lanes a pixel.
     """
 
     pixel: Any
     sample: Any
     weight: Any
     count: int
+    first: int
+    pixels: int
+    starts: Any
+
+    def begin(self, index):
+        """First lane of a pixel, counted from the first of this wavefront; ``count`` behind all."""
+        if isinstance(self.starts, int):
+            return index * dr.opaque(mi.UInt32, self.starts)
+        return dr.gather(mi.UInt32, self.starts, index)
 
 
 @dataclass(frozen=True)
@@ -84,10 +94,11 @@ class Allotment:
 
     def _even(self, first, pixels, start, each) -> Lanes:
         count = pixels * each
-        lane, each = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, each)
-        pixel = lane // each
-        sample = lane - pixel * each + dr.opaque(mi.UInt32, start)
-        return Lanes(pixel + dr.opaque(mi.UInt32, first), sample, None, count)
+        lane, divisor = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, each)
+        pixel = lane // divisor
+        sample = lane - pixel * divisor + dr.opaque(mi.UInt32, start)
+        pixel += dr.opaque(mi.UInt32, first)
+        return Lanes(pixel, sample, None, count, first, pixels, each)
 
     def _uneven(self, first, start, counts, n, more) -> Lanes:
         """``start``: number of each pixel's first sample; all else is the same in every pass."""
@@ -96,16 +107,20 @@ class Allotment:
             self._kept.clear()
             pixel = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
             place = np.arange(len(pixel), dtype=np.uint32)
-            place -= np.repeat((np.cumsum(counts) - counts).astype(np.uint32), counts)
+            starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.uint32)
+            place -= np.repeat(starts[:-1], counts)
             weight = np.repeat(((self.each + more) / n).astype(np.float32), counts)
             self._kept[key] = (
                 own(mi.UInt32, pixel),
                 own(mi.UInt32, place),
                 own(mi.Float, weight),
+                own(mi.UInt32, starts),
             )
-        pixel, place, weight = self._kept[key]
+        pixel, place, weight, starts = self._kept[key]
         sample = dr.gather(mi.UInt32, own(mi.UInt32, start.astype(np.uint32)), pixel) + place
-        return Lanes(pixel + dr.opaque(mi.UInt32, first), sample, weight, dr.width(pixel))
+        count = dr.width(pixel)
+        pixel = pixel + dr.opaque(mi.UInt32, first)
+        return Lanes(pixel, sample, weight, count, first, len(counts), starts)
 
 
 def in_proportion(noise: np.ndarray, each: int) -> np.ndarray | None:

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import own
+from .splat import image as weighted
 
 # Points at which a reconstruction filter is looked at.
 _STEPS = 1000
@@ -36,9 +37,7 @@ def sample_rays(sensor, sampler, pixel, wavelength):
 
     position = mi.Point2f(corner) + sampler.next_2d()
     ray, weight = rays_through(sensor, sampler, position, wavelength)
-    # With a box filter the offset within the pixel only adds rounding errors at pixel borders.
-    splat_at = mi.Point2f(corner) if film.rfilter().is_box_filter() else position
-    return ray, weight, splat_at
+    return ray, weight, position
 
 
 def rays_through(sensor, sampler, position, wavelength):
@@ -70,33 +69,23 @@ def wavelengths(sensor, u):
     return ray.wavelengths
 
 
-def splat(film, position, radiance, valid, spp, wavelengths, weight=None):
+def splat(film, lanes, position, radiance, valid, wavelengths):
     """One wavefront of samples as the film's own storage has it: TensorXf (height, width,
     channels), weighted by the reconstruction filter, the weight in the last channel.
 
     valid   alpha is 1 there, else 0.
-    spp     samples of a pixel that lie next to each other, in the mean.
-    weight  of each sample beside the filter's; None: 1.
     """
-    block = film.create_block()
-    block.set_coalesce(block.coalesce() and spp >= 4)
     alpha = dr.select(valid, mi.Float(1), mi.Float(0))
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        channels = film.prepare_sample(
-            radiance, wavelengths, block.channel_count(), mi.Float(1), alpha
-        )
+        count = film.create_block().channel_count()
+        channels = film.prepare_sample(radiance, wavelengths, count, mi.Float(1), alpha)
     else:
         rgb = to_rgb(radiance, wavelengths)
         channels = [rgb.x, rgb.y, rgb.z]
         if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
             channels.append(alpha)
         channels.append(mi.Float(1))
-    if weight is not None:
-        channels = [channel * weight for channel in channels]
-    block.put(position, channels)
-    image = block.tensor()
-    dr.eval(image)
-    return image
+    return weighted(film, lanes, position, channels)
 
 
 def to_rgb(spectrum, wavelengths):
@@ -104,24 +93,6 @@ def to_rgb(spectrum, wavelengths):
     if mi.is_spectral:
         return mi.spectrum_to_srgb(spectrum, wavelengths)
     return mi.Color3f(spectrum.x) if mi.is_monochromatic else spectrum
-
-
-def splat_channels(film, position, channels, spp, weight=None, box=False) -> np.ndarray:
-    """As :func:`splat` for values of any meaning, weight last: float64, height × width ×
-    channels. box: weighted by a box filter, not by the film's."""
-    like = film.create_block()
-    rfilter = mi.load_dict({"type": "box"}) if box else film.rfilter()
-    block = mi.ImageBlock(
-        like.size(),
-        like.offset(),
-        len(channels) + 1,
-        rfilter,
-        False,
-        coalesce=like.coalesce() and spp >= 4,
-    )
-    channels = [*channels, mi.Float(1)]
-    block.put(position, channels if weight is None else [c * weight for c in channels])
-    return block.tensor().numpy().astype(np.float64)
 
 
 def show(film, image):

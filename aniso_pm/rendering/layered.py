@@ -22,6 +22,7 @@ import numpy as np
 
 from ..transport.layers import CHANNELS, LIGHT, SURFACE
 from . import film as films
+from . import splat
 from .accumulate import mean_and_variance
 
 _SEEN = 9  # channels of colour, albedo, normal
@@ -53,14 +54,13 @@ class Layered:
         return len(_splatted(self.names)) + 2 + 2 * _SEEN * ("denoising" in self.names)
 
     def wavefront(
-        self, position, L, seen, gathered, ray, ray_weight, lanes, finite, spp
+        self, position, L, seen, gathered, ray, ray_weight, lanes, finite
     ) -> dict[str, np.ndarray]:
         """The arrays of one wavefront.
 
         L         radiance of its eye paths as it goes into the film.
         seen      layers.Seen of its eye paths; gathered: density.Gathered of their gather points.
         finite    of each path: samples whose radiance is not count as black.
-        spp       samples of a pixel that lie next to each other, in the mean.
         """
 
         def values(name) -> list[Any]:
@@ -77,12 +77,12 @@ class Layered:
         found = {}
         if any(name != "denoising" for name in self.names):
             channels = [v for name in _weighted(self.names) for v in values(name)]
-            splatted = films.splat_channels(self.film, position, channels, spp, lanes.weight)
+            splatted = _array(splat.image(self.film, lanes, position, [*channels, mi.Float(1)]))
             found["layers"] = np.concatenate([splatted, self._samples(lanes)], axis=2)
         if "denoising" in self.names:
             channels = [*_rgb(L, ray.wavelengths), *values("albedo"), *values("normal")]
-            found["denoising"] = films.splat_channels(
-                self.film, position, channels, spp, lanes.weight, box=True
+            found["denoising"] = _array(
+                splat.image(self.film, lanes, position, [*channels, mi.Float(1)], box=True)
             )
         return found
 
@@ -97,6 +97,10 @@ class Layered:
         count = dr.zeros(mi.UInt32, int(width) * int(height))
         dr.scatter_add(count, mi.UInt32(1), mi.UInt32(y * int(width) + x), inside)
         return count.numpy().reshape(int(height), int(width), 1).astype(np.float64)
+
+
+def _array(tensor) -> np.ndarray:
+    return tensor.numpy().astype(np.float64)
 
 
 def whole_pass(sums: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

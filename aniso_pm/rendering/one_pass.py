@@ -118,7 +118,6 @@ class Tracer:
         image   of the wavefronts before, or None.
         """
         decided, sensor, scene = self.decided, self.sensor, self.scene
-        film, each = sensor.film(), decided.allotment.each
         sampler = mi.load_dict({"type": "owen_sobol"})
         sampler.begin(stream_seed(self.seed, EYE), lanes.pixel, lanes.sample)
         ray, ray_weight, position = films.sample_rays(sensor, sampler, lanes.pixel, colour)
@@ -141,13 +140,13 @@ class Tracer:
         counts["eye_samples"] += lanes.count
         counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
         L = dr.select(finite, seen.L, 0) * ray_weight
-        splats = films.splat(film, position, L, seen.valid, each, ray.wavelengths, lanes.weight)
+        splats = films.splat(sensor.film(), lanes, position, L, seen.valid, ray.wavelengths)
         image = splats if image is None else image + splats
         dr.eval(image)
         layers: dict[str, Any] = {}
         if decided.layered is not None:
             layers = decided.layered.wavefront(
-                position, L, seen.seen, seen.gathered, ray, ray_weight, lanes, finite, each
+                position, L, seen.seen, seen.gathered, ray, ray_weight, lanes, finite
             )
         return image, layers
 
