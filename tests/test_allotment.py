@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -42,6 +43,39 @@ def test_weights_make_up_for_numbers(variant_llvm_rgb):
     total = np.bincount(found.pixel.numpy(), found.weight.numpy())
     np.testing.assert_allclose(total, 4, rtol=1e-6)
     assert done == 1
+
+
+def test_wavefronts_of_uneven_samples_are_alike(variant_llvm_rgb):
+    """Full, and of about one size: what is frozen is traced anew for other ones."""
+    counts = np.repeat([8, 64, 128], [900, 90, 10])
+    for most in (1000, 1500, 4000):
+        parts = [w.count for w, _ in Allotment(1000, 14, counts).wavefronts(0, 0, 0, most)]
+        assert sum(parts) == counts.sum()
+        assert max(parts) <= most and min(parts) > 0.85 * most * counts.sum() / sum(parts)
+
+
+def test_few_wavefronts_are_traced_in_python(variant_llvm_rgb, monkeypatch):
+    """Uneven samples in many wavefronts: replayed, not traced anew for every size."""
+    scene = mi.load_dict(room_with_ball(size=32))
+    random = np.random.default_rng(3)
+    counts = random.integers(4, 29, films.pixel_count(scene.sensors()[0].film()))
+    frozen = []
+
+    def settled(*args):
+        return replace(pilot.settle(*args), counts=counts)
+
+    def freeze(function):
+        frozen.append(dr_freeze(function))
+        return frozen[-1]
+
+    dr_freeze = dr.freeze
+    monkeypatch.setattr("aniso_pm.rendering.beginning.settle", settled)
+    monkeypatch.setattr("aniso_pm.rendering.beginning.WAVEFRONT", 1 << 11)
+    monkeypatch.setattr("drjit.freeze", freeze)
+    plugin = mi.load_dict(SMALL | {"passes": 2, "map": "global"})
+    mi.render(scene, integrator=plugin, spp=2 * 16)
+    assert plugin.statistics["replayed"]
+    assert all(function.n_recordings <= 3 for function in frozen)
 
 
 def test_numbers_follow_noise_within_bounds():

@@ -71,7 +71,9 @@ def test_passes_differ_from_each_other_and_between_seeds():
         ({"passes": 1}, 7, 100, [7]),
         ({"passes": 0, "time": 9.0}, 7, 100, [7, 7]),
         ({"passes": 0, "time": 9.0}, 64, 2**14, [32, 32]),
-        ({"passes": 0, "target_error": 0.1}, 64, 2**20, [1, 1]),
+        ({"passes": 0, "target_error": 0.1}, 64, 2**18, [4, 4]),
+        ({"passes": 0, "target_error": 0.1}, 64, 2**20, [2, 2]),
+        ({"passes": 0, "target_error": 0.1}, 64, 2**22, [1, 1]),
         ({"passes": 100, "time": 9.0}, 7, 100, [1, 1]),
     ],
 )

@@ -22,6 +22,10 @@ from ..arrays import own
 
 # Samples of a pixel as multiples of the mean: the fewest and the most.
 LEAST, MOST = 0.25, 8.0
+# The fewest in the mean that can be uneven.
+FEW = 4
+# Uneven wavefronts are filled so far, because their sizes differ a little.
+_FULL, _GOLDEN = 0.95, 0.5 * (5**0.5 - 1)
 
 
 @dataclass(frozen=True)
@@ -74,11 +78,15 @@ class Allotment:
             slices = largest
         elif self.counts is None:
             slices = -(-largest // (most // self.pixels))
-        else:  # rounding up adds less than one sample a pixel
-            room = most - self.pixels
-            slices = min(largest, math.ceil(int(n.sum()) / room)) if room > 0 else largest
+        else:
+            count = int(n.sum())
+            slices = 1 if count <= most else min(largest, math.ceil(count / (_FULL * most)))
+        # Pixels with as many samples take them in different slices: all slices are about as large.
+        shift: Any = 0
+        if self.counts is not None:
+            shift = (np.arange(self.pixels) * _GOLDEN % 1 * slices).astype(np.int64)
         for part in range(slices):
-            low, high = n * part // slices, n * (part + 1) // slices
+            low, high = ((n * k + shift) // slices for k in (part, part + 1))
             for first in range(0, self.pixels, at_once):
                 some = min(at_once, self.pixels - first)
                 done = (part + (first + some) / self.pixels) / slices
@@ -126,7 +134,7 @@ class Allotment:
 def in_proportion(noise: np.ndarray, each: int) -> np.ndarray | None:
     """Samples of each pixel in proportion to ``noise``, exactly ``each`` in the mean; None where
     that is too little to tell pixels apart."""
-    if each * LEAST < 1 or not noise.mean() > 0:
+    if each < FEW or not noise.mean() > 0:
         return None
     share = noise / noise.mean()
     for _ in range(8):  # bounds and mean together

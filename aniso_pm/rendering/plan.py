@@ -41,6 +41,7 @@ import numpy as np
 
 from ..transport import aim
 from . import footprint
+from .allotment import FEW
 from .tiles import SAMPLES, Tiles, smooth
 
 # Widths of kernels that are compared, and the range of those that are chosen, in pixels.
@@ -106,10 +107,11 @@ class Plan:
 
     @staticmethod
     def of(longest: float, each: int, *given, **more) -> Plan:
-        """Of passes whose work is ``longest`` at most, if they can be that short."""
+        """Of passes whose work is ``longest`` at most, if so many or fewer of FEW samples a pixel
+        do."""
         plan = Plan._of(each, *given, **more)
-        if plan.work > longest and each > 1:
-            plan = Plan._of(max(1, int(each * longest / plan.work)), *given, **more)
+        if plan.work > longest and each > FEW:
+            plan = Plan._of(max(FEW, int(each * longest / plan.work)), *given, **more)
         return plan
 
     @staticmethod

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from .allotment import FEW
 from .prepared import COLOUR, stream_seed
 from .settings import Settings
 
-# Eye samples of a pass where the number of passes is open: short against any budget.
-OPEN_PASS = 1 << 19
+# Eye samples of a pass where the number of passes is open: short against any budget. More where
+# that would be less than FEW a pixel, up to LARGE_PASS.
+OPEN_PASS, LARGE_PASS = 1 << 19, 1 << 21
 
 
 def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
@@ -42,13 +44,15 @@ def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Sh
     """How the passes share ``spp`` samples per pixel.
 
     With a fixed number of passes ``spp`` is the total, shared evenly. With ``passes = 0`` a pass
-    takes ``spp`` samples, but no more than make OPEN_PASS eye samples in all, and at least one.
+    takes ``spp`` samples, but no more than make OPEN_PASS eye samples in all, or FEW a pixel if
+    that is within LARGE_PASS, and at least one.
 
     Raises ValueError if there are fewer samples than passes, unless time or error may end them.
     """
     passes = settings.passes
     if passes == 0:
-        each, rest = max(1, min(spp, OPEN_PASS // pixels)), 0
+        most = max(1, OPEN_PASS // pixels, min(FEW, LARGE_PASS // pixels))
+        each, rest = min(spp, most), 0
     elif spp >= passes:
         each, rest = divmod(spp, passes)
     elif settings.open_ended:

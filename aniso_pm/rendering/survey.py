@@ -33,7 +33,7 @@ from ..transport import aim
 from ..transport.apart import Parts
 from ..transport.thinning import Thinning
 from . import footprint
-from .allotment import LEAST
+from .allotment import FEW
 from .film import noise_share, rays_through, wavelengths
 from .plan import (
     LEAST_SHARE,
@@ -52,7 +52,8 @@ from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
 
 # Work of an eye path: of its first ray, of a vertex.
 _CAMERA, _VERTEX = 0.3, 0.4
-# Work of a pass that is not to be exceeded where passes may have any length: a third of a second.
+# Work of a pass that is not to be exceeded where passes may have any length, but for FEW samples a
+# pixel: a third of a second.
 _LONGEST = 1.5e6
 # Another use of the map than "global" has to promise an error smaller by so much.
 _BETTER = 0.9
@@ -183,7 +184,7 @@ def _survey(plan: Plan, errors, counts, map_, points) -> Survey:
 def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray | None:
     """Samples of each pixel: where they differ most is a matter of a few pixels, so that many eye
     paths look, and nothing is gathered."""
-    if plan.each * LEAST < 1:
+    if plan.each < FEW:
         return None
     fine, coarse = Tiles.of(sensor, FINE), plan.tiles
     sampler, ray, lane = _pairs(sensor, fine, seed, 5)

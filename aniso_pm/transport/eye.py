@@ -31,6 +31,7 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     single = options.use == "global" and not options.general
     capacity = dr.width(ray) if single else max(2 * dr.width(ray), expected + expected // 8)
     while True:
+        capacity = _rounded_up(capacity)
         rows, room = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, capacity)
         points = map_tree(lambda v: dr.empty(type(v), capacity), _blank(options))  # noqa: B023
         L, valid, rows, points = (launch or eye_paths)(
@@ -46,6 +47,13 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     # Neighbours will look up the same photons.
     position = dr.gather(mi.Point3f, points.p, dr.arange(mi.UInt32, found))
     return L, valid, take(points, curve_order(position))
+
+
+def _rounded_up(capacity: int) -> int:
+    """By an eighth at most, so that wavefronts of about the same size have columns of the same:
+    what is frozen is traced anew for every other one."""
+    step = 1 << max(capacity.bit_length() - 4, 0)
+    return -(-capacity // step) * step
 
 
 def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room, see=None):
