@@ -15,7 +15,7 @@ def bench(
     groups: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[gather|trace|build|pass|memory|startup|kernels|error|denoise|all]...",
+            metavar="[gather|trace|build|pass|memory|startup|kernels|error|large|denoise|all]...",
             help="What to measure; everything by default.",
         ),
     ] = None,

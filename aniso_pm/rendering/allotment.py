@@ -83,7 +83,7 @@ class Allotment:
             slices = 1 if count <= most else min(largest, math.ceil(count / (_FULL * most)))
         # Pixels with as many samples take them in different slices: all slices are about as large.
         shift: Any = 0
-        if self.counts is not None:
+        if self.counts is not None and slices > 1:
             shift = (np.arange(self.pixels) * _GOLDEN % 1 * slices).astype(np.int64)
         for part in range(slices):
             low, high = ((n * k + shift) // slices for k in (part, part + 1))

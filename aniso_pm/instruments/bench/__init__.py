@@ -2,10 +2,10 @@
 
 Speeds are ratios within one run wherever that is possible: the machine they were measured on is
 then of little importance. A module of measurements is one idea and has a function
-``measure(quick)`` that yields rows: ``gathering`` and its data (``walls``) and rivals (``grid``),
-``building``, ``tracing``, ``passes``, ``memory``, ``startup``, ``kernels``, ``errors``,
-``denoising``. ``row`` says what a row is and prints it, ``timing`` takes the time, ``rooms`` has
-the scenes.
+``measure(quick)`` that yields rows (``errors`` another one for large pictures): ``gathering`` and
+its data (``walls``) and rivals (``grid``), ``building``, ``tracing``, ``passes``, ``memory``,
+``startup``, ``kernels``, ``errors``, ``denoising``. ``row`` says what a row is and prints it,
+``timing`` takes the time, ``rooms`` has the scenes.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from importlib import import_module
 
 from .row import Row
 
-# What `aniso-pm bench` calls each group: module.
+# What `aniso-pm bench` calls each group: module and function.
 GROUPS = {
-    "gather": "gathering",
-    "trace": "tracing",
-    "build": "building",
-    "pass": "passes",
-    "memory": "memory",
-    "startup": "startup",
-    "kernels": "kernels",
-    "error": "errors",
-    "denoise": "denoising",
+    "gather": ("gathering", "measure"),
+    "trace": ("tracing", "measure"),
+    "build": ("building", "measure"),
+    "pass": ("passes", "measure"),
+    "memory": ("memory", "measure"),
+    "startup": ("startup", "measure"),
+    "kernels": ("kernels", "measure"),
+    "error": ("errors", "measure"),
+    "large": ("errors", "measure_large"),
+    "denoise": ("denoising", "measure"),
 }
 
 
@@ -36,4 +37,5 @@ def measure(groups: list[str], quick: bool) -> Iterator[Row]:
            too small for some of the targets.
     """
     for group in groups:
-        yield from import_module(f"{__name__}.{GROUPS[group]}").measure(quick)
+        module, function = GROUPS[group]
+        yield from getattr(import_module(f"{__name__}.{module}"), function)(quick)

@@ -1,7 +1,8 @@
 """Error against run time as installed: what somebody gets who sets nothing.
 
 Relative MSE of ``path`` over that of the plain ``<integrator type="aniso_pm"/>`` after equal
-seconds, above 1 where the photon mapper wins, on each scene of the gallery at 160 × 120.
+seconds, above 1 where the photon mapper wins, on each scene of the gallery at 160 × 120, or at
+640 × 480 (``large``).
 ``path`` has the scene's sampler (in the gallery a stratified one); ``max_depth`` and
 ``hide_emitters`` are the scene's. Seeds run in turn, compilation is not counted. Beside it stand
 variance, bias² and energy, and the reference's own error: an error within ten times of that is
@@ -17,6 +18,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from aniso_pm.errors import InputError
 from aniso_pm.instruments import gallery
 from aniso_pm.instruments.report import metrics, reference, regions, runs
 from aniso_pm.instruments.report.experiment import require_reference
@@ -39,6 +41,9 @@ GOALS = {
 }
 CAUSTIC_GOAL = 8.0
 _SIZE = {"width": "160", "height": "120"}
+# Pictures of the usual size: as many seconds take fewer samples a pixel.
+LARGE_BUDGETS, LARGE_SEEDS = (5.0, 20.0), 3
+LARGE = {"width": "640", "height": "480"}
 _REGION_SEED, _WARM_SEED = 7001, 7002
 
 
@@ -63,11 +68,23 @@ def measure(
     """
     budgets, seeds = ((1.0,), 3) if quick else (BUDGETS, SEEDS)
     for file in files or [scene.file for scene in gallery.scenes()]:
-        yield from _scene(Path(file), list(budgets), seeds, plugins)
+        yield from _scene(Path(file), list(budgets), seeds, plugins, _SIZE)
 
 
-def _scene(file: Path, budgets, seeds: int, plugins) -> Iterator[Row]:
-    world = mi.load_file(str(file), optimize=False, **_SIZE)
+def measure_large(quick: bool) -> Iterator[Row]:
+    """Rows of the gallery at 640 × 480, as installed. quick: none."""
+    if quick:
+        yield Row("large: path over as installed", None, "×", None, "too slow for --quick")
+        return
+    for file in [Path(scene.file) for scene in gallery.scenes()]:
+        try:
+            yield from _scene(file, list(LARGE_BUDGETS), LARGE_SEEDS, {"as installed": {}}, LARGE)
+        except InputError as error:  # no reference of that size
+            yield Row(f"large: {file.stem}", None, "×", None, str(error))
+
+
+def _scene(file: Path, budgets, seeds: int, plugins, size: dict[str, str]) -> Iterator[Row]:
+    world = mi.load_file(str(file), optimize=False, **size)
     sensor = world.sensors()[0]
     found = require_reference(file, world, sensor)
     limits = {
@@ -87,13 +104,17 @@ def _scene(file: Path, budgets, seeds: int, plugins) -> Iterator[Row]:
 
     # --- All of one seed before the next ---
     for method in methods.values():
-        runs.warm_up(stage, method, None, _WARM_SEED)
+        if size is LARGE:  # as warm as budgets need it: whole passes would take longer
+            runs.run(stage, method, None, _WARM_SEED, budgets[:1])
+        else:
+            runs.warm_up(stage, method, None, _WARM_SEED)
     done: dict[str, list[runs.Run]] = {name: [] for name in methods}
     for seed in range(seeds):
         for name, method in methods.items():
             done[name].append(runs.run(stage, method, None, seed, budgets))
 
     weight = metrics.weights(found.halves)
+    group = "large" if size is LARGE else "error"
     for k, budget in enumerate(budgets):
         for region, mask in masks.items():
             tables = {}
@@ -104,10 +125,10 @@ def _scene(file: Path, budgets, seeds: int, plugins) -> Iterator[Row]:
                 images = np.stack([run.images[k] for run in done[name]])
                 ratio = metrics.ratio(tables["path"], tables[name])
                 yield Row(
-                    f"error: {file.stem}, {budget:g} s, {region}: path over {name}",
+                    f"{group}: {file.stem}, {budget:g} s, {region}: path over {name}",
                     ratio.value,
                     "×",
-                    _goal(file.stem, region, name),
+                    _goal(file.stem, region, name) if size is _SIZE else None,
                     _note(ratio, tables, name, images, found, mask, weight, done[name], k),
                 )
 
