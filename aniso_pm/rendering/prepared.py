@@ -1,4 +1,4 @@
-"""A Mitsuba scene with what was found out about it once, and the stages of a pass on it."""
+"""The stages of a pass on a scene: photon map, eye paths, density estimation."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..map import density, photon_word, summed
+from ..map import density, summed
 from ..map.gather_points import GatherPoints, map_tree, take
-from ..map.photon_map import EMPTY, PhotonMap, flux_bytes
+from ..map.photon_map import EMPTY, PhotonMap
 from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
 from ..transport.amends import repair_bounds
 from ..transport.split import split
 from ..transport.thinning import Thinning
 from ..transport.walk import WalkOptions
+from .decisions import Decisions
 from .footprint import TRIED, Footprint
-from .needs import Needs, read_scene
+from .needs import read_scene
 from .settings import Settings
 
 # Independent streams of random numbers.
@@ -57,20 +58,13 @@ class Launch:
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """A scene, its needs, the parameters, and the decisions that follow from them."""
+class Prepared(Decisions):
+    """What was decided about a scene, and how its paths are traced."""
 
-    scene: Any
-    needs: Needs
-    settings: Settings
-    hide_emitters: bool
-    emission: emission.Emission | None
     launch: Launch = Launch()
     light_wavefront: int | None = None  # light paths at once; None: photons.WAVEFRONT
     footprint: Footprint | None = None  # of pixels; None: one bandwidth for all of a pass
-    chosen: str | None = None  # use of the map that a pilot has found best, see ``undecided``
     aim: Aim | None = None  # of light paths, if a pilot has found that it pays
-    lobes_matter: bool = True  # kernels that follow lobes: a pilot may find that they do not
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -88,119 +82,6 @@ class Prepared:
         return replace(
             self, launch=Launch(dr.freeze(photons.light_paths), dr.freeze(eye.eye_paths))
         )
-
-    @property
-    def extent(self) -> float:
-        """Diagonal of the scene's bounding box, world units."""
-        return float(dr.norm(self.scene.bbox().extents()))
-
-    @property
-    def follow_lobes(self) -> bool:
-        """Keep the reflection lobes of eye paths?"""
-        matter = self.settings.kernel != "isotropic" and self.lobes_matter
-        return matter and len(self.needs.lobes) > 0
-
-    @property
-    def lobes_are_dispensable(self) -> bool:
-        """May a pilot choose discs everywhere? Not where somebody says how many photons, or how
-        large kernels are to be."""
-        s = self.settings
-        asked = s.photon_count or s.initial_radius or s.size == "epsilon"
-        return s.kernel == "auto" and not asked
-
-    @property
-    def deep(self) -> bool:
-        """May gather points lie deeper than the first vertex?"""
-        return len(self.needs.chains) > 0
-
-    @property
-    def undecided(self) -> bool:
-        """Is it for a pilot to say how the map is best used? ``map=auto`` has no choice where there
-        are no surfaces that paths walk on (nothing casts caustics: path tracing is best), nor where
-        there is light that only photons find (it takes the global map)."""
-        automatic = self.settings.map == "auto" and not self.settings.final_gather
-        return automatic and self.use == "global" and not self.needs.unseen and not self.chosen
-
-    @property
-    def use(self) -> str:
-        """How eye paths use the map; see ``walk``. As long as nobody has chosen, ``auto`` is
-        "global" where there is anything to choose."""
-        if self.chosen:
-            return self.chosen
-        wanted = bool(self.needs.receivers) and self.settings.depth_limit > self.min_segments
-        if not wanted or self.emission is None:
-            return "none"
-        if self.settings.final_gather:
-            return "final_gather"
-        if not self.deep and not self.needs.unseen and self.settings.map != "global":
-            return "none"
-        return "global" if self.settings.map == "auto" else self.settings.map
-
-    @property
-    def photons_are_dispensable(self) -> bool:
-        """May a pilot choose path tracing? Not where eye paths cannot find all light by themselves
-        (a point emits it, or a direction has all of it: what such a light sends over a mirror is
-        found by photons only), and not where somebody says how many photons, or how large kernels
-        are to be."""
-        delta = mi.EmitterFlags.Delta
-        asked = self.settings.photon_count or self.settings.initial_radius
-        return not asked and not any(mi.has_flag(e.flags(), delta) for e in self.scene.emitters())
-
-    @property
-    def crowding(self) -> int:
-        """Share of a wavefront's eye paths that may be traced at once: where paths leave gather
-        points at several vertices, fewer of them fit into the same memory."""
-        if not self.needs_map:
-            return 1
-        if self.use == "caustic":
-            return 8
-        return 2 if self.use == "final_gather" or self.needs.general else 1
-
-    @property
-    def min_segments(self) -> int:
-        """Segments of the shortest light path in the map."""
-        return 1 if self.needs.unseen else 2
-
-    @property
-    def needs_map(self) -> bool:
-        """Is there anything for photons to do?"""
-        return self.use != "none"
-
-    @property
-    def bytes_per_photon(self) -> int:
-        """Of a map at rest, index included: position and word, flux, direction, and one box of 16
-        bytes for every leaf and every inner node (at most 2 nodes for 4 photons), which have their
-        sums, too, where ``gather_tolerance`` asks for them."""
-        node = 16 + (20 + flux_bytes() if self.settings.gather_tolerance else 0)
-        return 16 + flux_bytes() + (4 if self.needs.general else 0) + node // 2
-
-    @property
-    def gather_depth(self) -> int:
-        """The limit that ``density.estimate`` has to test photons against: none if there is no
-        limit, or if all gather points lie at the first vertex and the map keeps the limit. Paths of
-        more than ``photon_word.SEGMENTS_MAX`` segments are not told apart."""
-        limit = self.settings.max_depth
-        tested = self.deep or self.use != "global"
-        return limit if tested and 0 < limit <= photon_word.SEGMENTS_MAX else 0
-
-    @property
-    def kernel_options(self) -> density.KernelOptions:
-        """How gather points get their kernels."""
-        s = self.settings
-        return density.KernelOptions(
-            self.follow_lobes, s.rule, s.size, s.epsilon, s.guard, s.max_aspect
-        )
-
-    @property
-    def light_layers(self) -> bool:
-        """Does anybody ask for light by how it came?"""
-        return any(name in layers.LIGHT for name in self.settings.layer_names)
-
-    @property
-    def surface_layers(self) -> bool:
-        """Does anybody ask for what eye paths see?"""
-        wanted = (*layers.SURFACE, "denoising")
-        return any(name in wanted for name in self.settings.layer_names)
 
     def photon_map(
         self,

@@ -1,0 +1,126 @@
+"""Scenes that lack something, or have what cannot be rendered."""
+
+import aniso_pm  # noqa: F401
+import mitsuba as mi
+import numpy as np
+import pytest
+from renders import array, camera_with_alpha, integrator
+from rooms import room, room_with_plate
+
+pytestmark = pytest.mark.usefixtures("without_pilot")
+
+
+@pytest.fixture
+def rgb(variant_llvm_rgb):
+    pass
+
+
+@pytest.fixture
+def scene(rgb):
+    return mi.load_dict(room_with_plate(16))
+
+
+def test_a_scene_without_emitters_is_black(rgb):
+    definition = room(size=8)
+    del definition["light"]["emitter"]
+    assert array(mi.render(mi.load_dict(definition), integrator=integrator(), spp=4)).max() == 0
+
+
+def test_a_scene_without_receivers_is_path_traced(rgb):
+    definition = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+        "sky": {"type": "constant"},
+        "ball": {"type": "sphere", "center": [0, 0, 4], "bsdf": {"type": "roughconductor"}},
+    }
+    scene = mi.load_dict(definition)
+    plugin = integrator(initial_radius=0.0)
+    image = array(mi.render(scene, integrator=plugin, spp=256))
+    path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=256))
+    np.testing.assert_allclose(image.mean(), path.mean(), rtol=0.01)
+    assert plugin.statistics["photons_emitted"] == 0
+
+
+def test_media_are_refused_with_one_sentence(rgb):
+    definition = room(size=8)
+    definition["fog"] = {
+        "type": "sphere",
+        "radius": 0.3,
+        "bsdf": {"type": "null"},
+        "interior": {"type": "homogeneous"},
+    }
+    scene = mi.load_dict(definition)
+    with pytest.raises(ValueError, match='shape "fog" bounds a participating medium'):
+        integrator().render(scene, spp=1)
+
+
+def test_a_camera_in_a_medium_is_refused(rgb):
+    definition = room(size=4)
+    definition["sensor"]["medium"] = {"type": "homogeneous", "albedo": 0.5}
+    with pytest.raises(ValueError, match='sensor "sensor" is in a participating medium'):
+        integrator().render(mi.load_dict(definition), spp=1)
+
+
+def test_a_point_light_of_sampling_weight_zero_is_dark_as_in_path(rgb):
+    definition = room(size=8)
+    definition["bulb"] = {"type": "point", "intensity": 20.0, "sampling_weight": 0.0}
+    image = array(mi.render(mi.load_dict(definition), integrator=integrator(), spp=64))
+    path = array(mi.render(mi.load_dict(definition), integrator=mi.load_dict({"type": "path"})))
+    assert image.mean() == pytest.approx(path.mean(), rel=0.1)  # 7 times as bright with the bulb
+
+
+def test_derivatives_are_refused_with_one_sentence(scene):
+    plugin = integrator()
+    with pytest.raises(Exception, match="derivatives are not supported"):
+        plugin.render_backward(scene, None, None)
+    with pytest.raises(Exception, match="derivatives are not supported"):
+        plugin.render_forward(scene, None)
+
+
+def test_a_scene_without_shapes_is_rendered(rgb):
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+            "sky": {"type": "constant", "radiance": 0.25},
+        }
+    )
+    image = array(mi.render(scene, integrator=integrator(initial_radius=0.0), spp=4))
+    np.testing.assert_allclose(image[..., :3], 0.25, rtol=1e-3)
+
+
+@pytest.mark.parametrize("instanced", [False, True])
+def test_light_that_only_photons_find_is_refused_among_glossy_surfaces(rgb, instanced):
+    definition = room_with_plate(size=4)
+    if instanced:
+        definition["group"] = {"type": "shapegroup", "plate": definition.pop("plate")}
+        definition["copy"] = {"type": "instance", "g": {"type": "ref", "id": "group"}}
+    definition["light"]["emitter"] = {"type": "directionalarea"}
+    with pytest.raises(ValueError, match="DirectionalArea.*parallel light"):
+        integrator().render(mi.load_dict(definition), spp=1)
+
+
+@pytest.mark.parametrize("radius", [1e-9, 1e3])
+def test_a_radius_of_the_wrong_magnitude_is_refused_with_the_right_one(rgb, radius):
+    with pytest.raises(ValueError, match='"initial_radius" is .* but the scene is .* large'):
+        integrator(initial_radius=radius).render(mi.load_dict(room(size=4)), spp=1)
+
+
+@pytest.mark.parametrize("front", ["null", "thindielectric"])
+def test_hidden_sky_stays_hidden_behind_null_surfaces_as_in_path(rgb, front):
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera_with_alpha(8),
+            "sky": {"type": "constant", "radiance": 0.5},
+            "sheet": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, 2]).rotate([0, 1, 0], 180),
+                "bsdf": {"type": front},
+            },
+        }
+    )
+    ours = array(mi.render(scene, integrator=integrator(hide_emitters=True), spp=256))
+    path = mi.load_dict({"type": "path", "hide_emitters": True})
+    path = array(mi.render(scene, integrator=path, spp=256))
+    np.testing.assert_allclose(ours.mean((0, 1)), path.mean((0, 1)), rtol=0.05, atol=0.005)
