@@ -14,7 +14,8 @@ The samples of the first sum lie next to each other in memory.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -34,85 +35,106 @@ def image(film, lanes: Lanes, position, channels: Sequence[Any], box: bool = Fal
     box       weighted by a box filter, not by the film's.
     """
     rfilter = film.rfilter()
-    box = box or rfilter.is_box_filter()
-    reach = 0 if box else math.ceil(rfilter.radius() - 0.5)
-    window = lambda d: mi.Float(1) if box else rfilter.eval(d)  # noqa: E731
     width, height = (int(n) for n in film.crop_size())
-    corner = film.crop_offset()
     edge = rfilter.border_size() if film.sample_border() else 0
-    wide = width + 2 * edge  # of the rows that are sampled
-
+    if box or rfilter.is_box_filter():
+        grid = _Grid(film.crop_offset(), width, edge, 0, lambda d: mi.Float(1))
+    else:
+        reach = math.ceil(rfilter.radius() - 0.5)
+        grid = _Grid(film.crop_offset(), width, edge, reach, rfilter.eval)
     dr.eval(position, list(channels), lanes.weight)
     total = dr.zeros(mi.Float, height * width * len(channels))
-    first, last = lanes.first // wide - edge, (lanes.first + lanes.pixels - 1) // wide - edge
-    top, bottom = max(first - reach, 0), min(last + reach + 1, height)
+    # Rows of the picture in which the first and the last of the samples lie.
+    first, last = ((n // grid.wide) - edge for n in (lanes.first, lanes.first + lanes.pixels - 1))
+    top, bottom = max(first - grid.reach, 0), min(last + grid.reach + 1, height)
     step = max(1, _BAND // width)
     for t in range(top, bottom, step):
-        # Rows t to t + rows of the picture, out of those from ``low`` to ``high`` of samples.
-        rows = min(step, bottom - t)
-        low, high = max(t - reach, first), min(t + rows + reach, last + 1)
-        sums = _along_rows(
-            lanes, position, channels, window, reach, low, high, width, wide, edge, corner
-        )
-        _across(total, sums, reach, low, high, t, rows, width)
+        end = min(t + step, bottom)
+        low, high = max(t - grid.reach, first), min(end + grid.reach, last + 1)
+        sums = _along_rows(grid, low, high, lanes, position, channels)
+        _across_rows(grid, low, high, sums, t, end, total)
     return mi.TensorXf(total, (height, width, len(channels)))
 
 
+@dataclass(frozen=True)
+class _Grid:
+    """Pixels of a picture, out of those that are sampled, ``edge`` more on each side.
+
+    corner  of the picture on the film; width: of its rows, in pixels.
+    reach   R; window: f.
+    """
+
+    corner: Any
+    width: int
+    edge: int
+    reach: int
+    window: Callable[[Any], Any]
+
+    @property
+    def wide(self) -> int:
+        """Of the rows that are sampled."""
+        return self.width + 2 * self.edge
+
+    @property
+    def offsets(self) -> range:
+        """d."""
+        return range(-self.reach, self.reach + 1)
+
+
 @dr.syntax
-def _along_rows(
-    lanes, position, channels, window, reach, low, high, width, wide, edge, corner
-) -> list[Any]:
-    """A of the rows low to high: for d = −R … R and every channel, in this order."""
-    lane = dr.arange(mi.UInt32, (high - low) * width)
-    across = dr.opaque(mi.UInt32, width)
-    row = lane // across
-    column = lane - row * across
-    x = mi.Float(column) + (dr.opaque(mi.Float, corner.x) + 0.5)
-    y = mi.Float(row) + (dr.opaque(mi.Float, corner.y + low) + 0.5)
+def _along_rows(grid, low, high, lanes, position, channels) -> list[Any]:
+    """A of the rows low to high, for every d and every channel, in this order."""
+    lane = dr.arange(mi.UInt32, (high - low) * grid.width)
+    width = dr.opaque(mi.UInt32, grid.width)
+    row = lane // width
+    column = lane - row * width
+    x = mi.Float(column) + (dr.opaque(mi.Float, grid.corner.x) + 0.5)
+    y = mi.Float(row) + (dr.opaque(mi.Float, grid.corner.y + low) + 0.5)
 
     # --- Pixels from c − R to c + R, and their samples ---
-    begin = dr.opaque(mi.Int32, edge - reach) + mi.Int32(column)
-    end = dr.minimum(begin + (2 * reach + 1), dr.opaque(mi.Int32, wide))
-    row_begins = mi.Int32(row * dr.opaque(mi.UInt32, wide))
-    row_begins += dr.opaque(mi.Int32, (low + edge) * wide - lanes.first)
+    begin = mi.Int32(column) + dr.opaque(mi.Int32, grid.edge - grid.reach)
+    end = dr.minimum(begin + len(grid.offsets), dr.opaque(mi.Int32, grid.wide))
+    start = mi.Int32(row * dr.opaque(mi.UInt32, grid.wide))
+    start += dr.opaque(mi.Int32, (low + grid.edge) * grid.wide - lanes.first)
     pixels = dr.opaque(mi.Int32, lanes.pixels)
     begin, end = (
-        mi.UInt32(dr.clip(row_begins + pixel, 0, pixels)) for pixel in (dr.maximum(begin, 0), end)
+        lanes.begin(mi.UInt32(dr.clip(start + pixel, 0, pixels)))
+        for pixel in (dr.maximum(begin, 0), end)
     )
-    sample, end = lanes.begin(begin), lanes.begin(end)
 
-    extra: Any = lanes.weight
-    of = lambda column, k: column if dr.width(column) == 1 else dr.gather(mi.Float, column, k)  # noqa: E731
-    sums = [mi.Float(0) for _ in range((2 * reach + 1) * len(channels))]
-    while dr.hint(sample < end, label="reconstruction filter"):
-        at = dr.gather(mi.Point2f, position, sample)
+    window, offsets, extra = grid.window, grid.offsets, lanes.weight
+    of = lambda values, k: values if dr.width(values) == 1 else dr.gather(mi.Float, values, k)  # noqa: E731
+    sums = [mi.Float(0) for _ in range(len(offsets) * len(channels))]
+    while dr.hint(begin < end, label="reconstruction filter"):
+        at = dr.gather(mi.Point2f, position, begin)
         weight = window(at.x - x)
         if dr.hint(extra is not None, mode="scalar"):
-            weight *= of(extra, sample)
-        values = [weight * of(channel, sample) for channel in channels]
-        for d in range(2 * reach + 1):
-            down = window(at.y - y - (d - reach))
+            weight *= of(extra, begin)
+        values = [weight * of(channel, begin) for channel in channels]
+        for d in offsets:
+            down = window(at.y - y - d)
             for k in range(len(values)):
-                j = d * len(values) + k
+                j = (d - offsets[0]) * len(values) + k
                 sums[j] = dr.fma(down, values[k], sums[j])
-        sample += 1
+        begin += 1
     dr.eval(sums)
     return sums
 
 
-def _across(total, sums, reach, low, high, t, rows, width):
-    """Σ_d A_d of rows t to t + rows, into ``total``."""
-    channels = len(sums) // (2 * reach + 1)
-    lane = dr.arange(mi.UInt32, rows * width)
-    across = dr.opaque(mi.Int32, width)
-    row = mi.Int32(lane) // across + dr.opaque(mi.Int32, t - low)
-    inside = dr.opaque(mi.Int32, high - low)
-    start = mi.Int32(lane) + dr.opaque(mi.Int32, (t - low) * width)
+def _across_rows(grid, low, high, sums, top, bottom, total):
+    """Σ_d A_d of rows ``top`` to ``bottom``, into ``total``. sums: A of the rows low to high."""
+    channels = len(sums) // len(grid.offsets)
+    lane = dr.arange(mi.UInt32, (bottom - top) * grid.width)
+    width = dr.opaque(mi.Int32, grid.width)
+    row = mi.Int32(lane) // width + dr.opaque(mi.Int32, top - low)
+    rows = dr.opaque(mi.Int32, high - low)
+    start = mi.Int32(lane) + dr.opaque(mi.Int32, (top - low) * grid.width)
     found = [mi.Float(0) for _ in range(channels)]
-    for d in range(-reach, reach + 1):
-        active = (row >= d) & (row < inside + d)
+    for d in grid.offsets:
+        active = (row >= d) & (row < rows + d)
+        source = mi.UInt32(start - d * width)
         for k in range(channels):
-            column = sums[(d + reach) * channels + k]
-            found[k] += dr.gather(mi.Float, column, mi.UInt32(start - d * across), active)
-    dr.scatter(total, mi.ArrayXf(found), lane + dr.opaque(mi.UInt32, t * width))
+            column = sums[(d + grid.reach) * channels + k]
+            found[k] += dr.gather(mi.Float, column, source, active)
+    dr.scatter(total, mi.ArrayXf(found), lane + dr.opaque(mi.UInt32, top * grid.width))
     dr.eval(total)
