@@ -31,11 +31,12 @@ from aniso_pm.map import density
 from aniso_pm.rendering.film import pixel_weights
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
-from conftest import tick
+from conftest import leave_out_the_pilot, tick
 from rooms import room, room_with_ball, room_with_plate
 
-# One process: the report that most tests look at is made once.
-pytestmark = pytest.mark.xdist_group("report")
+# One process: the report that most tests look at is made once. What a pilot would choose is no
+# matter here.
+pytestmark = [pytest.mark.xdist_group("report"), pytest.mark.usefixtures("without_pilot")]
 
 SCENE = """<scene version="3.0.0">
   <default name="width" value="32"/>
@@ -103,6 +104,7 @@ def done(scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
     with pytest.MonkeyPatch.context() as patch:
         tick(patch)
+        leave_out_the_pilot(patch)
         assert cli.main(["report", str(scene), "-o", str(out), *BRIEF]) == 0
     return out
 

@@ -107,11 +107,13 @@ class Plan:
 
     @staticmethod
     def of(longest: float, each: int, *given, **more) -> Plan:
-        """Of passes whose work is ``longest`` at most, if so many or fewer of FEW samples a pixel
-        do."""
+        """Of passes whose work is ``longest`` at most; up to four times as long where they would
+        have less than FEW samples a pixel, and with one sample of any length."""
         plan = Plan._of(each, *given, **more)
-        if plan.work > longest and each > FEW:
-            plan = Plan._of(max(FEW, int(each * longest / plan.work)), *given, **more)
+        for limit, least in ((longest, FEW), (4 * longest, 1)):
+            if plan.work > limit and plan.each > least:
+                fewer = max(least, int(plan.each * limit / plan.work))
+                plan = Plan._of(fewer, *given, **more)
         return plan
 
     @staticmethod

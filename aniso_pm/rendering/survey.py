@@ -52,8 +52,8 @@ from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
 
 # Work of an eye path: of its first ray, of a vertex.
 _CAMERA, _VERTEX = 0.3, 0.4
-# Work of a pass that is not to be exceeded where passes may have any length, but for FEW samples a
-# pixel: a third of a second.
+# Work of a pass that is not to be exceeded where passes may have any length (see ``Plan.of``): a
+# third of a second.
 _LONGEST = 1.5e6
 # Another use of the map than "global" has to promise an error smaller by so much.
 _BETTER = 0.9
