@@ -19,6 +19,8 @@ DEFINITIONS = {
     CAUSTIC: "pixels that owe at least a quarter of their light (that of the reference) to the "
     "caustic photon map: light that came over glass, mirrors or glossy metal to a diffuse surface",
 }
+# Pixels that are darker than so much of the mean have caustics by the blur of a kernel alone.
+_DARK = 0.01
 # A region of fewer pixels is left out: its means would say nothing.
 MIN_PIXELS = 30
 _SPP, _PHOTONS = 16, 400_000
@@ -36,7 +38,8 @@ def find(prepared: Prepared, sensor, reference: np.ndarray, seed: int) -> dict[s
     if prepared.deep:
         _, caustic = _look(prepared.with_(map="caustic", final_gather=False), sensor, seed)
         light = _smooth(reference.mean(-1))
-        masks[CAUSTIC] = _smooth(caustic) > CAUSTIC_SHARE * np.maximum(light, 1e-9)
+        dark = max(_DARK * float(light.mean()), 1e-9)
+        masks[CAUSTIC] = _smooth(caustic) > CAUSTIC_SHARE * np.maximum(light, dark)
     return {name: mask for name, mask in masks.items() if mask.sum() >= MIN_PIXELS}
 
 
