@@ -80,12 +80,11 @@ def test_caustics_that_eye_paths_rarely_find_have_a_map(variant_llvm_rgb):
     assert found.errors.get("none") is None
 
 
-def test_a_use_that_is_given_is_kept(variant_llvm_rgb):
-    for use in ("global", "caustic"):
-        found, prepared = settled(ball(SKY, PLASTIC), map=use)
-        assert found.use == use and not found.errors and not prepared.undecided
-    found, prepared = settled(ball(SKY, PLASTIC), final_gather=True)
-    assert found.use == "final_gather" and not prepared.undecided
+@pytest.mark.parametrize("use", ["caustic", *slow("global", "final_gather")])
+def test_a_use_that_is_given_is_kept(variant_llvm_rgb, use):
+    given = {"final_gather": True} if use == "final_gather" else {"map": use}
+    found, prepared = settled(ball(SKY, PLASTIC), **given)
+    assert found.use == use and not found.errors and not prepared.undecided
 
 
 SCENES = {
