@@ -276,8 +276,8 @@ def warm_up(stage: Stage, method: Method, radius: float | None, seed: int) -> di
             integrator, _ = _mitsubas(stage, method)
             scene, sensor = stage.seen_by(method)
             for count in CALLS:
-                # Looked at: else whoever evaluates something next waits for the picture.
-                np.array(integrator.render(scene, sensor=sensor, seed=seed, spp=count))
+                integrator.render(scene, sensor=sensor, seed=seed, spp=count)
+            dr.eval()  # what is left, or whoever evaluates something next would wait for it
         dr.sync_thread()
         seconds = _compilation()
     finally:
