@@ -277,7 +277,8 @@ def warm_up(stage: Stage, method: Method, radius: float | None, seed: int) -> di
             scene, sensor = stage.seen_by(method)
             for count in CALLS:
                 integrator.render(scene, sensor=sensor, seed=seed, spp=count)
-            dr.eval()  # what is left, or whoever evaluates something next would wait for it
+            # The sampler's last state, not computed yet, or the next method would wait for it.
+            sensor.sampler().seed(0, 1)
         dr.sync_thread()
         seconds = _compilation()
     finally:
