@@ -25,6 +25,11 @@ def variant_llvm_rgb():
 
 
 @pytest.fixture
+def rgb(variant_llvm_rgb):
+    pass
+
+
+@pytest.fixture
 def variant_llvm_mono():
     yield from _use("llvm_ad_mono")
 

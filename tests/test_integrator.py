@@ -13,11 +13,6 @@ pytestmark = pytest.mark.usefixtures("without_pilot")
 
 
 @pytest.fixture
-def rgb(variant_llvm_rgb):
-    pass
-
-
-@pytest.fixture
 def scene(rgb):
     return mi.load_dict(room_with_plate(16))
 

@@ -10,16 +10,6 @@ from rooms import room, room_with_plate
 pytestmark = pytest.mark.usefixtures("without_pilot")
 
 
-@pytest.fixture
-def rgb(variant_llvm_rgb):
-    pass
-
-
-@pytest.fixture
-def scene(rgb):
-    return mi.load_dict(room_with_plate(16))
-
-
 @pytest.mark.parametrize(
     "name, value, word",
     [

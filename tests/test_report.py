@@ -7,6 +7,7 @@ from dataclasses import replace
 from importlib import resources
 
 import aniso_pm  # noqa: F401
+import drjit as dr
 import jsonschema
 import mitsuba as mi
 import numpy as np
@@ -460,6 +461,19 @@ def test_looking_at_pictures_does_not_cost_time(monkeypatch, ticking):
     # With 200 ms more a pass there would be 3 of them.
     assert found.passes == swift.passes and found.passes[1] > 10
     assert sum(found.stages.values()) == pytest.approx(found.seconds[1])
+
+
+def test_path_leaves_nothing_that_others_have_to_compute():
+    """The state of its sampler, for example: a kernel as large as its last call."""
+    world = mi.load_dict(room(size=16))
+    (path,) = methods.parse("path")
+    runs.warm_up(stage_of(world), path, None, 9)
+    ours = mi.load_dict({"type": "aniso_pm", "photon_count": 2000, "passes": 2})
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        ours.render(world, spp=2)
+        sizes = {kernel["size"] for kernel in dr.kernel_history()}
+    assert 16**2 in sizes and runs.CALLS[-1] * 16**2 not in sizes
 
 
 def test_pictures_are_snapshots_of_one_run(ticking):

@@ -11,16 +11,6 @@ from rooms import room, room_with_plate
 pytestmark = pytest.mark.usefixtures("without_pilot")
 
 
-@pytest.fixture
-def rgb(variant_llvm_rgb):
-    pass
-
-
-@pytest.fixture
-def scene(rgb):
-    return mi.load_dict(room_with_plate(16))
-
-
 def test_mono_sees_the_luminance_of_grey_scenes(variant_llvm_mono):
     definition = room(size=16)
     scene = mi.load_dict(definition)

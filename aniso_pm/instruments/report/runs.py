@@ -238,6 +238,13 @@ def _calls(stage: Stage, method: Method, radius, seed: int, recorder: _Recorder)
             beside.add(image, taken)
             stages = {"render": seconds}
             done = recorder.add(beside.picture, stages, calls, spp, beside.layers)
+    _put_back(sensor)
+
+
+def _put_back(sensor) -> None:
+    """The sampler's last state has not been computed: the next method would do it, on its clock, at
+    the price of the whole call."""
+    sensor.sampler().seed(0, 1)
 
 
 def _mitsubas(stage: Stage, method: Method) -> tuple[Any, bool]:
@@ -277,8 +284,7 @@ def warm_up(stage: Stage, method: Method, radius: float | None, seed: int) -> di
             scene, sensor = stage.seen_by(method)
             for count in CALLS:
                 integrator.render(scene, sensor=sensor, seed=seed, spp=count)
-            # The sampler's last state, not computed yet, or the next method would wait for it.
-            sensor.sampler().seed(0, 1)
+            _put_back(sensor)
         dr.sync_thread()
         seconds = _compilation()
     finally:
