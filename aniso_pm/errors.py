@@ -14,6 +14,11 @@ class InputError(Exception):
     """The user asked for something that cannot be done; the message is one line that says what."""
 
 
+class Unsupported(ValueError):
+    """The variant or the scene asks for something that this integrator does not do; the message is
+    one sentence that names it."""
+
+
 class Failed(RuntimeError):
     """Rendering cannot go on, for a reason outside of scene and parameters (workers that are gone,
     for example); the message is one line that says what, and what to do."""

@@ -10,13 +10,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from aniso_pm.errors import Unsupported
 from aniso_pm.rendering import progressive
 from aniso_pm.rendering.controls import Controls
 from aniso_pm.rendering.done import Batch
 from aniso_pm.rendering.film import pixel_weights as film_weights
 from aniso_pm.rendering.layered import develop
 from aniso_pm.rendering.pilot import USUAL, automatic_radius
-from aniso_pm.rendering.prepared import Unsupported, prepare
+from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.state import Checkpoint
 

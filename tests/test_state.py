@@ -46,6 +46,11 @@ def test_states_merge_into_the_picture_of_all_passes(states):
         total = merge({path.name: State.load(path) for path in order})
         assert total.passes == [[0, 4]] and total.statistics["spp"] == 8
         assert total.statistics["photons_emitted"] == 4 * 3000
+        # What is chosen once does not add up; what each pass takes does.
+        one = State.load(paths[0]).statistics
+        for name in ("share_of_gathers", "error_behind_lobes", "wavefront_eye_samples", "map"):
+            assert total.statistics[name] == one[name], name
+        assert total.statistics["seconds"]["photons"] > one["seconds"]["photons"]
         close(total.arrays["first"][..., :-1] / total.arrays["first"][..., -1:], whole)
     plugin = integrator(passes=4)
     render(scene, plugin, 8)

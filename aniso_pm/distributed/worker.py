@@ -93,7 +93,7 @@ def render(job: Job, passes: list[list[int]], task: str) -> dict[str, Any]:
 
 def add(*parts: dict[str, Any]) -> dict[str, Any]:
     """One for several of what :func:`render` or this function returned."""
-    from aniso_pm.rendering.state import add_counts, joined
+    from aniso_pm.rendering.state import added, joined
 
     first, *others = parts
     arrays = {name: array.copy() for name, array in first["arrays"].items()}
@@ -101,8 +101,8 @@ def add(*parts: dict[str, Any]) -> dict[str, Any]:
     for part in others:
         for name, array in part["arrays"].items():
             arrays[name] += array
-        counts = add_counts(counts, part["counts"])
-        seconds = add_counts(seconds, part["seconds"])
+        counts = added(counts, part["counts"])
+        seconds = added(seconds, part["seconds"])
         passes += part["passes"]
     return {"passes": joined(passes), "arrays": arrays, "counts": counts, "seconds": seconds}
 
@@ -142,7 +142,7 @@ class _Rendering:
         if found:
             raise Differs(f"it has loaded another scene than the client: {'; '.join(found[:3])}")
         settings = Settings(**job.render["settings"])
-        if limit and not settings.max_memory:
+        if limit and on_cpu and not settings.max_memory:  # a GPU has memory of its own
             settings = settings.with_(max_memory=limit)
         prepared = prepare(world, settings, job.render["hide_emitters"])
         settled = grown(job.render["settled"])
@@ -159,7 +159,7 @@ class _Rendering:
         from aniso_pm.rendering.state import numbers
 
         compiled = self.run.stopping.compiling
-        self.run.begin()
+        self.run.forget_passes()
         for index in numbers(ranges):
             self.run.render_pass(index)
         batch = self.run.batch()

@@ -102,6 +102,8 @@ def _self_test(variant: str, llvm_is_wrong: bool) -> list[Check]:
         error, fix = "does not start", "mend LLVM, above"
     else:
         fix = "reinstall: pip install --force-reinstall aniso-pm"
+        if variant.startswith("cuda"):
+            fix += " (in a container, OptiX needs NVIDIA_DRIVER_CAPABILITIES=all)"
 
     reached = run.stdout.split()
     return [

@@ -109,9 +109,10 @@ def give_back(count: int):
     """Let go of memory that Dr.Jit keeps for later, where that of ``count`` points is much.
 
     What is kept serves blocks of the same size only: without this, the peak is the sum of all
-    sizes that ever were. Small blocks are worth keeping for the next pass.
+    sizes that ever were. Small blocks are worth keeping for the next pass, and so are all blocks of
+    a GPU: their sizes are powers of two, and giving them back stops every device.
     """
-    if count >= _LARGE:
+    if count >= _LARGE and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         dr.sync_thread()
         dr.flush_malloc_cache()
 

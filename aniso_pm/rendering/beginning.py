@@ -56,11 +56,11 @@ class Decided:
     def identity(self, sensor, seed: int) -> dict[str, Any]:
         """What a state has to agree in, to be gone on from (see ``digest``)."""
         return digest.identity(self.scene, sensor, seed, self.shares.text) | {
-            "use of the map": self.settled.use,
-            "lobes followed": self.scene.follow_lobes,
-            "initial radius": self.settled.radius,
-            "photon count": self.settled.count,
-            "samples per pixel of a pass": self.shares.each,
+            digest.USE: self.settled.use,
+            digest.LOBES: self.scene.follow_lobes,
+            digest.RADIUS: self.settled.radius,
+            digest.COUNT: self.settled.count,
+            digest.SAMPLES: self.shares.each,
         }
 
     def statistics(self, given) -> dict[str, Any]:
@@ -103,18 +103,18 @@ def decide(
 
     # --- What is chosen ---
     # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
-    exactly = known.get("samples per pixel of a pass")
+    exactly = known.get(digest.SAMPLES)
     each = exactly or share.each
     settled = controls.settled or settle(scene, sensor, seed, each, bool(exactly))
     settled = replace(
         settled,
-        use=known.get("use of the map") or settled.use,
-        count=settings.photon_count or known.get("photon count") or settled.count,
-        radius=settings.initial_radius or known.get("initial radius") or settled.radius,
+        use=known.get(digest.USE) or settled.use,
+        count=settings.photon_count or known.get(digest.COUNT) or settled.count,
+        radius=settings.initial_radius or known.get(digest.RADIUS) or settled.radius,
     )
     share = replace(share, each=settled.each)
     scene = settled.applied(scene)
-    scene = replace(scene, lobes_matter=known.get("lobes followed", scene.follow_lobes))
+    scene = replace(scene, lobes_matter=known.get(digest.LOBES, scene.follow_lobes))
 
     # --- What follows ---
     # Variances are worth their memory where there can be any, now or after a merge.

@@ -87,7 +87,7 @@ class Decisions:
 
     @property
     def crowding(self) -> int:
-        """Share of a wavefront's eye paths that may be traced at once: where paths leave gather
+        """How many times fewer eye paths than usual are traced at once: where paths leave gather
         points at several vertices, fewer of them fit into the same memory."""
         if not self.needs_map:
             return 1

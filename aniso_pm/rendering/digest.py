@@ -22,6 +22,10 @@ from .._version import __version__
 _SAME_RADIUS = 0.01
 # Normals that Mitsuba computes itself are sums in the order of threads: never twice the same.
 _UNSTABLE = "vertex_normals"
+# Entries for what a pilot may choose, filled in by ``beginning``.
+USE, LOBES = "use of the map", "lobes followed"
+RADIUS, COUNT = "initial radius", "photon count"
+SAMPLES = "samples per pixel of a pass"
 
 
 def scene_entries(scene) -> dict[str, str]:
@@ -58,10 +62,10 @@ def camera_entries(sensor, with_sampler: bool = True) -> dict[str, Any]:
 
 
 def identity(prepared, sensor, seed: int, samples_per_pass: str) -> dict[str, Any]:
-    """Everything that a pass depends on but its number. The entries "initial radius" and "photon
-    count", which may be chosen automatically, are filled in by the renderer. ``max_memory`` is left
-    out: smaller wavefronts draw other random numbers, but passes remain independent of each other,
-    so that machines of any size may add to one picture."""
+    """Everything that a pass depends on but its number. What a pilot may choose (USE and the other
+    entries above) is filled in by ``beginning``. ``max_memory`` is left out: smaller wavefronts
+    draw other random numbers, but passes remain independent of each other, so that machines of any
+    size may add to one picture."""
     elsewhere = ("passes", "time", "target_error", "initial_radius", "photon_count", "max_memory")
     parameters = {
         f'parameter "{name}"': value
@@ -88,7 +92,7 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
         a, b = there.get(name), here.get(name)
         if a == b:
             continue
-        if name == "initial radius" and a and b and math.isclose(a, b, rel_tol=_SAME_RADIUS):
+        if name == RADIUS and a and b and math.isclose(a, b, rel_tol=_SAME_RADIUS):
             continue
         if a is None or b is None:
             result.append(f"{name} is only in {'the other' if b is None else 'this'} one")

@@ -10,23 +10,7 @@ import numpy as np
 from . import state
 from .accumulate import NAMES, Sums
 from .layered import plus, whole_pass
-
-# What a pass counts.
-COUNTS = (
-    "photons_emitted",
-    "photons_stored",
-    "photons_rejected",
-    "photons_gathered",
-    "eye_samples",
-    "eye_samples_rejected",
-    "gather_points",
-    "gather_points_anisotropic",
-    "gather_points_clamped",
-    "gather_points_capped",
-    "gather_points_degenerate",
-    "gather_points_off_surface",
-    "spp",
-)
+from .state import COUNTS
 
 
 class Traced(NamedTuple):
@@ -96,7 +80,7 @@ class Done(NamedTuple):
         return Done(
             sums.plus(traced.image),
             state.extended(self.passes, index),
-            {name: n + traced.counts.get(name, 1) for name, n in self.counts.items()},
+            state.added(self.counts, traced.counts | {"passes": 1}),
             traced.layers and plus(self.layers, whole_pass(traced.layers)),
         )
 
@@ -107,7 +91,7 @@ class Done(NamedTuple):
         return Done(
             more if self.sums is None else self.sums.joined(more),
             state.joined([*self.passes, *batch.passes]),
-            {name: n + batch.counts[name] for name, n in self.counts.items()},
+            state.added(self.counts, batch.counts),
             plus(self.layers, layers) if layers else self.layers,
         )
 

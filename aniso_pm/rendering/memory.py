@@ -19,9 +19,10 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from ..errors import Unsupported
 from ..map.photon_map import flux_bytes
 from ..transport import photons
-from .prepared import Prepared, Unsupported
+from .prepared import Prepared
 
 GIB = 1 << 30
 # Light paths and eye samples of the smallest wavefronts: below, launching takes longer than work.

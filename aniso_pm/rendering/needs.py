@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import mitsuba as mi
 
+from ..errors import Unsupported
 from ..map.receivers import has_walked_part, is_bent, is_lambertian, may_gather
 from ..ndf import children, nested_bsdfs, roughness_source
 from ..transport.emission import only_photons_see
@@ -43,7 +44,7 @@ class Needs:
 def read_scene(scene, gather_roughness: float) -> Needs:
     """Inspect all emitters and BSDFs of a scene. gather_roughness: see ``receivers``.
 
-    Raises ValueError naming the shape where the scene has participating media, or glossy surfaces
+    Raises Unsupported naming the shape where the scene has participating media, or glossy surfaces
     together with light that emitter sampling cannot find; neither is supported.
     """
     needs = Needs()
@@ -52,7 +53,7 @@ def read_scene(scene, gather_roughness: float) -> Needs:
             needs.unseen.append(emitter_name(emitter))
     for sensor in scene.sensors():
         if sensor.get_medium() is not None:
-            raise ValueError(
+            raise Unsupported(
                 f'aniso_pm: sensor "{sensor.id()}" is in a participating medium, which this '
                 'integrator does not support; remove the medium or use the integrator "volpath"'
             )
@@ -61,7 +62,7 @@ def read_scene(scene, gather_roughness: float) -> Needs:
     for shape in scene.shapes():
         name = shape.id() or shape.class_name()
         if shape.is_medium_transition():
-            raise ValueError(
+            raise Unsupported(
                 f'aniso_pm: shape "{name}" bounds a participating medium, which this integrator '
                 'does not support; remove the medium or use the integrator "volpath"'
             )
@@ -120,7 +121,7 @@ def _listed(names: Counter[str]) -> list[str]:
 
 def _refuse_unlit(needs: Needs, evidence: str):
     if needs.unseen:
-        raise ValueError(
+        raise Unsupported(
             f'aniso_pm: emitter "{needs.unseen[0]}" casts parallel light that the surface '
             f'"{evidence}" cannot be lit by in this integrator (glossy or transmitting, or maybe '
             'so); use "directional", "spot" or "area" instead'

@@ -12,16 +12,17 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import is_interrupt
+from ..errors import is_interrupt, one_line
 from ..map.photon_map import PhotonMap
 from ..transport.thinning import Thinning
 from . import film as films
 from .beginning import Decided
-from .clock import Clock
-from .done import COUNTS, Traced
+from .done import Traced
 from .layered import plus
 from .prepared import EYE, PROBE, THINNING, stream_seed
 from .schedule import bandwidth, wavelength_sample
+from .stage_times import Clock
+from .state import COUNTS
 
 
 class _Room:
@@ -68,6 +69,7 @@ class Tracer:
             # Dr.Jit cannot record every scene (materials written in Python, for example).
             if is_interrupt(error) or not self.replayed:
                 raise
+            mi.Log(mi.LogLevel.Debug, f"aniso_pm: passes are not replayed: {one_line(error)}")
             self.replayed, self.scene = False, self.scene.thawed()
             return self._trace(index, report)
 
@@ -131,8 +133,17 @@ class Tracer:
         if scene.footprint is not None:
             pixel = scene.footprint.in_pass(index).seen_by(lanes.pixel)
             scene = replace(scene, footprint=pixel)
-        room, lap = self._points.room, self.clock.lap
-        seen = scene.radiance(sampler, ray, self.map, radius, random, room, lap, thinning, True)
+        seen = scene.radiance(
+            sampler,
+            ray,
+            self.map,
+            radius,
+            random,
+            expected=self._points.room,
+            lap=self.clock.lap,
+            thinning=thinning,
+            for_layers=True,
+        )
         self._points.seen(_count(seen.gathered, counts))
 
         # --- Into the image ---

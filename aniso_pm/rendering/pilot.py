@@ -21,7 +21,7 @@ from ..map.photon_map import EMPTY
 from ..transport import aim
 from . import survey
 from .film import one_each, wavelengths
-from .prepared import PILOT, Prepared, stream_seed
+from .prepared import PILOT, PILOT_CAMERA, PILOT_EYE, Prepared, stream_seed
 
 # Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
 PHOTONS_PER_KERNEL = 60
@@ -42,7 +42,7 @@ _SMALLEST, LARGEST, _STEPS = 1.2e-5, 0.1, 14
 def camera_rays(sensor, seed: int):
     """Rays through random points of the film's crop window."""
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 2)), _RAYS)
+    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, PILOT_CAMERA)), _RAYS)
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, _ = sensor.sample_ray(
         mi.Float(sensor.shutter_open()), mi.Float(0.5), sampler.next_2d(), aperture
@@ -109,16 +109,16 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
     worth = count / found.aim.variance if found.aim else count
     radius = radius or radius_at(found.points, found.map, scene, worth)
     return Settled(
-        found.use,
-        found.errors,
-        count,
-        radius,
-        found.each,
-        found.share,
-        found.counts,
-        found.widths,
-        found.aim,
-        round(found.lobes, 2),
+        use=found.use,
+        errors=found.errors,
+        count=count,
+        radius=radius,
+        each=found.each,
+        share=found.share,
+        counts=found.counts,
+        widths=found.widths,
+        aim=found.aim,
+        lobes=round(found.lobes, 2),
     )
 
 
@@ -148,7 +148,7 @@ def automatic_radius(scene: Prepared, rays, seed: int, map_=None) -> float:
         pilot = scene.with_(photon_count=min(scene.settings.photon_count, _PATHS))
         map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 1)), dr.width(rays))
+    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, PILOT_EYE)), dr.width(rays))
     points = scene.trace(sampler, rays)[2] if map_.stored else None
     return radius_at(points, map_, scene, scene.settings.photon_count)
 

@@ -106,19 +106,21 @@ class Plan:
     lobes: float = 0.0
 
     @staticmethod
-    def of(longest: float, each: int, *given, **more) -> Plan:
+    def of(longest: float, each: int, **given) -> Plan:
         """Of passes whose work is ``longest`` at most; up to four times as long where they would
-        have less than FEW samples a pixel, and with one sample of any length."""
-        plan = Plan._of(each, *given, **more)
+        have less than FEW samples a pixel, and with one sample of any length. given: as of
+        ``_of``."""
+        plan = Plan._of(each, **given)
         for limit, least in ((longest, FEW), (4 * longest, 1)):
             if plan.work > limit and plan.each > least:
                 fewer = max(least, int(plan.each * limit / plan.work))
-                plan = Plan._of(fewer, *given, **more)
+                plan = Plan._of(fewer, **given)
         return plan
 
     @staticmethod
     def _of(
         each: int,
+        *,
         tiles: Tiles,
         choose: bool,
         light_paths: int | None,
@@ -133,10 +135,13 @@ class Plan:
         work: Any = None,
     ) -> Plan:
         """
-        choose  widths of kernels.
+        each    eye samples of a pixel in a pass.
+        choose  widths of kernels: there is no given radius.
+        light_paths  of a pass if they are given, else 0 or None.
         filtered  variance of eye paths that the film leaves (``film.noise_share``).
         total   work after which ``error`` is that of the mean over all passes.
         whole   work of path tracing.
+        use     of the map; weight: of each pair.
         v_own   of an eye path, without what it gathers; later: what it has more because it goes on
                 beyond the first gathered part.
         found   in the map; None: there is none.
@@ -151,83 +156,134 @@ class Plan:
             share = np.full(1, 1.0 if use == "none" else LEAST_SHARE)
             nothing = np.zeros(len(whole))
             return Plan(
-                tiles, use, each, share, 0.0, np.ones(1), error, pass_, work, nothing, nothing
+                tiles=tiles,
+                use=use,
+                each=each,
+                share=share,
+                light_paths=0.0,
+                widths=np.ones(1),
+                error=error,
+                work=pass_,
+                path_work=work,
+                gathered=nothing,
+                noise=nothing,
             )
 
-        # --- Variances and bias² of each pair, relative to the light there ---
-        a, b, emitted = found.a, found.b, found.emitted
-        v_gather = tiles.trusted(filtered * within(a, b, weight))
-        shared, alone = of_photons(found.wide_a - found.wide_b, weight)
-        mid_shared, mid_alone = of_photons(a - b, weight)
-        alone, mid_alone = filtered * alone, filtered * mid_alone
-        # Neighbours have these in common, as far as kernels reach: a few pixels.
-        root = math.sqrt(filtered)
-        shared, mid_shared = root * shared, root * mid_shared
-        v_alone, v_shared = tiles.trusted(mid_alone), tiles.trusted(mid_shared)
-        changed_a, changed_b = found.wide_a - a, found.wide_b - b
-        change = changed_a[:, 0] * changed_b[:, 1] + changed_a[:, 1] * changed_b[:, 0]
-        change *= 0.5 * weight
+        noise = _Noise.of(found, tiles, weight, filtered)
 
         # --- Decisions ---
-        share, paths = np.ones(len(whole)), float(light_paths or 5 * emitted)
-        narrow, wide = (NARROW, WIDE) if choose else (1.0, 1.0)
-        widths = np.full(len(whole), narrow)
+        share, paths = np.ones(len(whole)), float(light_paths or 5 * found.emitted)
+        widths = np.full(len(whole), NARROW if choose else 1.0)
         eye_work = float(work.mean())
-        light, met = LIGHT_PATH + LEFT * found.stored / emitted, found.met
-        aimed = 1.0
+        light, met, aimed = LIGHT_PATH + LEFT * found.stored / found.emitted, found.met, 1.0
         if found.aim:
-            light, met = light * found.aim.work, met * found.aim.photons
-            aimed = found.aim.variance
+            light, met, aimed = light * found.aim.work, met * found.aim.photons, found.aim.variance
         for _ in range(_ROUNDS):
-            own = 1 / (share * each)
-            # A pass that a pixel reads less than once counts when it is read.
-            often = np.maximum(1, own)
-            b_1 = wide**2 * (often * shared + own * alone)
-            b_1 += narrow**2 * (often * mid_shared + own * mid_alone)
-            b_1 *= 0.5 * emitted * aimed
+            b_1 = aimed * noise.by_photons(share * each, choose)
             if choose:
-                widths = kernel_widths(tiles, b_1, change, PASSES * paths).ravel()
-            area = float(np.mean((widths / narrow) ** 2))
-            thinner = (narrow / widths) ** 2 * aimed * emitted / paths
-            gather = _GATHER * found.points + _MET * met * area * paths / emitted
+                widths = kernel_widths(tiles, b_1, noise.change, PASSES * paths).ravel()
+                area = (widths / NARROW) ** 2
+            else:
+                area = np.ones(len(whole))
+            thinner = aimed * found.emitted / (paths * area)
+            gather = _GATHER * found.points
+            gather += _MET * met * float(area.mean()) * paths / found.emitted
             if v_eye > 0:
-                worth = eye_work / (v_eye * gather)
-                share = np.sqrt((v_gather + v_alone * thinner) * worth)
-                # Less than one in a pass: then a gather is alone with what it would share.
-                more = np.sqrt((v_gather + (v_alone + v_shared) * thinner) * worth)
-                share = np.where(share * each < 1, np.minimum(more, 1 / each), share)
-            # In steps, so that machines whose arithmetic differs in the last digits agree.
-            share = np.ceil(16 * np.clip(share, LEAST_SHARE, 1)) / 16
-            eye_noise = max(v_eye + float((v_gather / share).mean()), 1e-30)
+                share = noise.share(thinner, eye_work / (v_eye * gather), each)
+            eye_noise = max(v_eye + float((noise.gather / share).mean()), 1e-30)
             gather *= float(share.mean())
             by_photons = max(0.0, float((b_1 / widths**2).mean()))
             if not light_paths:
                 costs = (eye_work + gather) / (light * tiles.pixels)
                 paths = max(each * tiles.pixels * math.sqrt(by_photons * costs / eye_noise), 1.0)
+
+        # --- What they promise ---
         pass_ = each * tiles.pixels * (eye_work + gather) + paths * light
-        noise_left = pass_ / total
-        error = (eye_noise / each + by_photons / paths) * noise_left
-        blur = change * (widths / NARROW) ** 3 if choose else np.zeros(len(whole))
+        left = pass_ / total
+        error = (eye_noise / each + by_photons / paths) * left
+        blur = noise.change * (widths / NARROW) ** 3 if choose else np.zeros(len(whole))
         error += _bias2(float(blur.mean()))
-        follow = np.clip(found.over_lobes.sum(1) / np.maximum(a.sum(1), 1e-30), 0, 1)
-        behind = max(0.0, float((follow * b_1 / widths**2).mean())) / paths * noise_left
+        follow = np.clip(found.over_lobes.sum(1) / np.maximum(found.a.sum(1), 1e-30), 0, 1)
+        behind = max(0.0, float((follow * b_1 / widths**2).mean())) / paths * left
         behind += _bias2(float((follow * blur).mean()))
-        noise = (v_gather + v_alone * thinner) / (filtered * share)
         return Plan(
-            tiles,
-            use,
-            each,
-            share,
-            paths,
-            widths,
-            error,
-            pass_,
-            work + gather,
-            found.light.mean(1),
-            noise,
-            found.aim,
-            behind / max(error, 1e-30),
+            tiles=tiles,
+            use=use,
+            each=each,
+            share=share,
+            light_paths=paths,
+            widths=widths,
+            error=error,
+            work=pass_,
+            path_work=work + gather,
+            gathered=found.light.mean(1),
+            noise=(noise.gather + noise.alone * thinner) / (filtered * share),
+            aim=found.aim,
+            lobes=behind / max(error, 1e-30),
         )
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """Variances of each pair, relative to the light there; see the module's head.
+
+    gather  V_g; alone, shared: V_gp and V_p through narrow kernels. These three as they can be
+            trusted (``Tiles.trusted``).
+    narrow, wide  V_p and V_gp as measured, through narrow kernels and through wide ones.
+    change  ⟨D D'⟩.
+    emitted  light paths of each map: N_0.
+    """
+
+    gather: np.ndarray
+    alone: np.ndarray
+    shared: np.ndarray
+    narrow: tuple[np.ndarray, np.ndarray]
+    wide: tuple[np.ndarray, np.ndarray]
+    change: np.ndarray
+    emitted: int
+
+    @staticmethod
+    def of(found: Found, tiles: Tiles, weight, filtered: float) -> _Noise:
+        """weight, filtered: as for ``Plan._of``."""
+
+        def of_photons_filtered(difference):
+            # Neighbours have what is shared in common, as far as kernels reach: a few pixels.
+            shared, alone = of_photons(difference, weight)
+            return math.sqrt(filtered) * shared, filtered * alone
+
+        a, b = found.a, found.b
+        narrow = of_photons_filtered(a - b)
+        changed_a, changed_b = found.wide_a - a, found.wide_b - b
+        change = changed_a[:, 0] * changed_b[:, 1] + changed_a[:, 1] * changed_b[:, 0]
+        return _Noise(
+            gather=tiles.trusted(filtered * within(a, b, weight)),
+            alone=tiles.trusted(narrow[1]),
+            shared=tiles.trusted(narrow[0]),
+            narrow=narrow,
+            wide=of_photons_filtered(found.wide_a - found.wide_b),
+            change=0.5 * weight * change,
+            emitted=found.emitted,
+        )
+
+    def by_photons(self, gathers, choose: bool) -> np.ndarray:
+        """B₁, the variance B of kernels of one pixel (where widths are chosen; else of the given
+        ones), of one light path. gathers: of a pixel in a pass."""
+        own = 1 / gathers
+        # A pass that a pixel reads less than once counts when it is read.
+        often = np.maximum(1, own)
+        sizes = (NARROW, WIDE) if choose else (1.0, 1.0)
+        b_1 = sizes[1] ** 2 * (often * self.wide[0] + own * self.wide[1])
+        b_1 += sizes[0] ** 2 * (often * self.narrow[0] + own * self.narrow[1])
+        return 0.5 * self.emitted * b_1
+
+    def share(self, thinner, worth: float, each: int) -> np.ndarray:
+        """q of each pair. thinner: by what photons' variance is multiplied; worth: C/(V_r C_g)."""
+        share = np.sqrt((self.gather + self.alone * thinner) * worth)
+        # Less than one in a pass: then a gather is alone with what it would share.
+        more = np.sqrt((self.gather + (self.alone + self.shared) * thinner) * worth)
+        share = np.where(share * each < 1, np.minimum(more, 1 / each), share)
+        # In steps, so that machines whose arithmetic differs in the last digits agree.
+        return np.ceil(16 * np.clip(share, LEAST_SHARE, 1)) / 16
 
 
 def _bias2(change: float) -> float:

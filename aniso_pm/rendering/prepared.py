@@ -11,13 +11,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import Unsupported
 from ..map import density, summed
 from ..map.gather_points import GatherPoints, map_tree, take
 from ..map.photon_map import EMPTY, PhotonMap
 from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
 from ..transport.amends import repair_bounds
-from ..transport.split import split
+from ..transport.gathered_layers import split
 from ..transport.thinning import Thinning
 from ..transport.walk import WalkOptions
 from .decisions import Decisions
@@ -25,12 +26,11 @@ from .footprint import TRIED, Footprint
 from .needs import read_scene
 from .settings import Settings
 
-# Independent streams of random numbers.
+# Independent streams of random numbers (see ``stream_seed``).
 EYE, PROBE, PHOTONS, PILOT, COLOUR, THINNING = range(6)
-
-
-class Unsupported(ValueError):
-    """The variant or the scene asks for something that this integrator does not do."""
+# Those of the pilot: its photons, eye paths of the automatic radius, random camera rays, pairs,
+# their pixels, pairs of the finer look.
+_, PILOT_EYE, PILOT_CAMERA, PILOT_PAIRS, PILOT_PIXELS, PILOT_FINE = range(6)
 
 
 @dataclass(frozen=True)
@@ -102,16 +102,16 @@ class Prepared(Decisions):
         s = self.settings
         plain = "marked" if self.light_layers else "ignored"
         options = photons.TraceOptions(
-            s.depth_limit - 1,
-            s.rr_depth,
-            {"global": plain, "caustic": "only"}.get(self.use, "marked"),
-            bool(self.needs.general),
-            s.gather_roughness,
-            bool(self.needs.unseen),
-            bool(self.needs.bent),
-            wavelengths,
-            self.aim,
-            remember,
+            max_depth=s.depth_limit - 1,
+            rr_depth=s.rr_depth,
+            caustics={"global": plain, "caustic": "only"}.get(self.use, "marked"),
+            general=bool(self.needs.general),
+            roughness=s.gather_roughness,
+            unseen_light=bool(self.needs.unseen),
+            bent=bool(self.needs.bent),
+            wavelengths=wavelengths,
+            aim=self.aim,
+            remember=remember,
         )
         seed = stream_seed(seed, PHOTONS, index)
         map_ = photons.build_map(
@@ -120,10 +120,10 @@ class Prepared(Decisions):
             s.photon_count,
             seed,
             options,
-            expected,
-            self.launch.light,
-            lap,
-            self.light_wavefront,
+            expected=expected,
+            launch=self.launch.light,
+            lap=lap,
+            wavefront=self.light_wavefront,
         )
         if s.gather_tolerance > 0 and map_.stored:
             map_ = replace(map_, sums=summed.build(map_))
@@ -138,20 +138,20 @@ class Prepared(Decisions):
         asked for."""
         s = self.settings
         options = WalkOptions(
-            self.use,
-            s.depth_limit,
-            s.rr_depth,
-            self.min_segments,
-            self.hide_emitters,
-            self.needs_map,
-            self.follow_lobes and self.needs_map,
-            self.deep,
-            bool(self.needs.general),
-            s.gather_roughness,
-            self.footprint is not None and self.needs_map,
-            thinning,
-            for_layers and self.light_layers,
-            for_layers and self.surface_layers,
+            use=self.use,
+            max_depth=s.depth_limit,
+            rr_depth=s.rr_depth,
+            min_segments=self.min_segments,
+            hide_emitters=self.hide_emitters,
+            gathers=self.needs_map,
+            follow_lobes=self.follow_lobes and self.needs_map,
+            deep=self.deep,
+            general=bool(self.needs.general),
+            roughness=s.gather_roughness,
+            measure=self.footprint is not None and self.needs_map,
+            thinning=thinning,
+            light=for_layers and self.light_layers,
+            surface=for_layers and self.surface_layers,
         )
         launch = partial(self.launch.eye, see=see) if see else self.launch.eye
         return eye.trace(self.scene, sampler, ray, options, expected, launch)
@@ -305,11 +305,8 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
             "polarisation); choose llvm_ad_rgb or another unpolarized variant"
         )
     repair_bounds(scene)  # before light from outside is aimed at them
-    try:
-        needs = read_scene(scene, settings.gather_roughness)
-        source = emission.prepare(scene) if scene.emitters() else None
-    except ValueError as error:
-        raise Unsupported(str(error)) from None
+    needs = read_scene(scene, settings.gather_roughness)
+    source = emission.prepare(scene) if scene.emitters() else None
     prepared = Prepared(scene, needs, settings, hide_emitters, source)
     radius, extent = settings.initial_radius, prepared.extent
     if radius and scene.shapes() and not 1e-7 * extent <= radius <= 10 * extent:

@@ -11,18 +11,19 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 from ..errors import Failed, is_interrupt
 from . import advice, memory, state
 from . import film as films
 from .accumulate import mean_and_variance, relative_standard_error
 from .beginning import Decided, decide
-from .clock import Clock
 from .controls import Controls, Rendered
 from .done import Batch, Done
 from .one_pass import Tracer
 from .prepared import Prepared
 from .schedule import bandwidth
+from .stage_times import Clock
 from .stopping import Stopping
 
 
@@ -64,6 +65,7 @@ class Run:
     """One call of ``render``: which passes, what is told of them, and what is kept."""
 
     decided: Decided  # from ``start`` on
+    identity: dict[str, Any]  # of a rendering with a checkpoint, from ``start`` on
     tracer: Tracer | None = None
 
     def __init__(self, scene, sensor, seed, spp, controls, statistics):
@@ -159,13 +161,13 @@ class Run:
             self._report(index, 1)
             self._after_pass(index)
 
-    def begin(self):
+    def forget_passes(self):
         """Forget all passes that are done."""
         self.done = Done.nothing()
         self.clock.seconds.clear()
 
     def batch(self) -> Batch:
-        """The passes since ``begin``."""
+        """The passes since ``forget_passes``."""
         done = self.done
         return Batch(done.passes, done.arrays(), done.counts, dict(self.clock.seconds))
 
@@ -185,7 +187,7 @@ class Run:
     def _check_error(self):
         """Estimate the error after each pass, and rarer the more there are, if anybody asks."""
         asked = self.given.settings.target_error or self.controls.progress or self.controls.callback
-        if asked and self.stopping.is_checkpoint(self.passes):
+        if asked and self.stopping.error_is_due(self.passes):
             self._estimate_error()
 
     def _estimate_error(self):
@@ -212,7 +214,8 @@ class Run:
             error = self.statistics["relative_error"]
             total = self.stopping.expected_total(count, error)
             text = f"{count} passes" + (f", error {error:.2%}" if error else "")
-            self.controls.progress(count, total, text)
+            with self.stopping.not_counted():
+                self.controls.progress(count, total, text)
 
     def _after_pass(self, index: int):
         checkpoint, callback = self.controls.checkpoint, self.controls.callback
@@ -222,14 +225,16 @@ class Run:
             if due:
                 self._estimate_error()
             if self.controls.so_far:
-                self.controls.so_far(self.variance, self.done.layers, self.passes)
+                with self.stopping.not_counted():
+                    self.controls.so_far(self.variance, self.done.layers, self.passes)
         if callback:
             with self.stopping.not_counted():
                 callback(index, self.film.develop(), dict(self.statistics))
         if due:
             checkpoint.write(self._state())
             if checkpoint.on_write:
-                checkpoint.on_write()
+                with self.stopping.not_counted():
+                    checkpoint.on_write()
         if due or callback:
             self.clock.lap("output")
 
@@ -246,8 +251,8 @@ class Run:
     # --- At the end ---
 
     def keep_unfinished(self) -> bool:
-        """After an interruption: is there a picture? Whole passes only, or the wavefronts of the
-        first one."""
+        """After an interruption: keep whole passes, or the wavefronts of the first one where there
+        are none. Is there a picture?"""
         unfinished = self.tracer and self.tracer.unfinished
         if self.done.sums is None and unfinished:
             self.done = Done.part(unfinished)

@@ -16,19 +16,36 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ..pictures import output
 from ..transport.layers import parse
+from .accumulate import NAMES as _ARRAYS
 from .accumulate import mean_and_variance
 from .digest import differences
 from .layered import develop
 
 VERSION = 1
-_ARRAYS = ("first", "square", "cross")
+_N = TypeVar("_N", int, float)
 _OPTIONAL = ("layers", "denoising")
+# What a pass counts.
+COUNTS = (
+    "photons_emitted",
+    "photons_stored",
+    "photons_rejected",
+    "photons_gathered",
+    "eye_samples",
+    "eye_samples_rejected",
+    "gather_points",
+    "gather_points_anisotropic",
+    "gather_points_clamped",
+    "gather_points_capped",
+    "gather_points_degenerate",
+    "gather_points_off_surface",
+    "spp",
+)
 
 
 class StateError(ValueError):
@@ -133,7 +150,7 @@ def merge(states: dict[str, State]) -> State:
             raise StateError(f"{name}: pass {common} is already in the states before it")
         passes += state.passes
         arrays = {k: v + state.arrays[k] for k, v in arrays.items()}
-        statistics = add_counts(statistics, state.statistics)
+        statistics = _merged(statistics, state.statistics)
         seconds += state.seconds
     return State(first.identity, first.film, joined(passes), seconds, statistics, arrays)
 
@@ -163,18 +180,16 @@ def describe(passes) -> str:
     return ", ".join(f"{a}-{b - 1}" if b - a > 1 else f"{a}" for a, b in passes) or "none"
 
 
-def add_counts(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Statistics over both: counts and seconds add up, everything else is that of ``b``."""
-    result = a | b
-    for name, value in b.items():
-        if isinstance(value, dict):
-            result[name] = add_counts(a.get(name, {}), value)
-        elif type(value) in (int, float) and name not in _NOT_ADDITIVE:
-            result[name] = a.get(name, 0) + value
-    return result
+def _merged(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+    """Statistics over the passes of both: counts and seconds add up, everything else is that of
+    ``b``."""
+    counts = {name: a.get(name, 0) + b.get(name, 0) for name in (*COUNTS, "passes")}
+    return a | b | counts | {"seconds": added(a.get("seconds", {}), b.get("seconds", {}))}
 
 
-_NOT_ADDITIVE = ("initial_radius", "radius", "photon_count", "relative_error")
+def added(a: dict[str, _N], b: dict[str, _N]) -> dict[str, _N]:
+    """Sums by name."""
+    return {name: a.get(name, 0) + b.get(name, 0) for name in a | b}
 
 
 def _holds(passes, number: int) -> bool:

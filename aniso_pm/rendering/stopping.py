@@ -1,4 +1,5 @@
-"""When to stop: number of passes, time, estimated error, whichever comes first.
+"""When to stop: time or estimated error, whichever comes first (the number of passes is
+``progressive.Run.numbers``').
 
 Time is wall-clock time from the call on, without the compilation of kernels, which happens once, in
 the first pass, and depends on what is cached, and without what callbacks take. Rendering ends as
@@ -73,7 +74,7 @@ class Stopping:
 
     @property
     def compiling(self) -> float:
-        """Seconds of compilation, and what else does not count, so far."""
+        """Seconds of compilation so far."""
         return self._compiling
 
     def set_aside(self, seconds: float):
@@ -85,7 +86,7 @@ class Stopping:
         aside = self._compiling + self._elsewhere
         return self.spent_before + time.perf_counter() - self._began - aside
 
-    def is_checkpoint(self, count: int) -> bool:
+    def error_is_due(self, count: int) -> bool:
         """Is the error estimated after ``count`` passes? After each of the first 20, then at steps
         of 5 %: a function of the count alone, so that a resumed rendering stops at the same one."""
         return count > 1 and int(math.log(count) / _STRIDE) > int(math.log(count - 1) / _STRIDE)

@@ -5,7 +5,8 @@ need more samples.
 How variances become decisions is told in ``plan``.
 
 *Use of the map.* Where it is open (``Prepared.undecided``), the eye paths of the pilot go on as in
-path tracing and tell apart what each use leaves to them (see ``apart``). The use of the least
+path tracing and tell apart what each use leaves to them (see ``survey_parts``). The use of the
+least
 
     bias² + (A/n + B/N) (n P (C + q C_g) + N C_p) / (M n P C_0)
 
@@ -30,7 +31,7 @@ from ..map.gather_points import take
 from ..map.photon_map import PhotonMap, caustics
 from ..map.spectra import channel_mean
 from ..transport import aim
-from ..transport.apart import Parts
+from ..transport.survey_parts import Parts
 from ..transport.thinning import Thinning
 from . import footprint
 from .allotment import FEW
@@ -47,7 +48,7 @@ from .plan import (
     Plan,
     within,
 )
-from .prepared import PILOT, Prepared, stream_seed
+from .prepared import PILOT, PILOT_FINE, PILOT_PAIRS, Prepared, stream_seed
 from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
 
 # Work of an eye path: of its first ray, of a vertex.
@@ -110,22 +111,32 @@ def look(
     longest = math.inf if exactly or scene.settings.passes else _LONGEST
     # What uses are compared after: the work of path tracing, whatever the length of their passes.
     total = PASSES * each * tiles.pixels * float(seen.work.mean())
-    given = radius is None, light_paths, filtered, total, seen.work
-    decide = partial(Plan.of, longest, each, tiles, *given)
+    decide = partial(
+        Plan.of,
+        longest,
+        each,
+        tiles=tiles,
+        choose=radius is None,
+        light_paths=light_paths,
+        filtered=filtered,
+        total=total,
+        whole=seen.work,
+    )
     if seen.points is None or not min(map_.stored for map_ in maps):
         use = scene.use
         if use == "survey":
             use = "none" if scene.photons_are_dispensable else "caustic"
         light = seen.own + seen.later + (0 if use == "caustic" else seen.caustic)
         weight = tiles.weight(light)
-        plan = decide(use, weight, within(light, light, weight))
+        plan = decide(use=use, weight=weight, v_own=within(light, light, weight))
         return _survey(plan, {}, pixel_counts(plan, scene, sensor, seed), None, None)
     own = seen.own
     weigh = lambda gathered: tiles.weight(own + gathered)  # noqa: E731
     if scene.use != "survey":
         found = read(maps, seen.points, weigh)
         weight = weigh(found.light)
-        plan = decide(scene.use, weight, within(own, own, weight), found)
+        v_own = within(own, own, weight)
+        plan = decide(use=scene.use, weight=weight, v_own=v_own, found=found)
         return _survey(plan, {}, pixel_counts(plan, scene, sensor, seed), maps[0], seen.points)
 
     # --- The global map ---
@@ -133,19 +144,20 @@ def look(
     found = read(maps, first, weigh)
     weight = weigh(found.light)
     v_own = within(own, own, weight)
-    best = decide("global", weight, v_own, found, work=seen.early)
+    decide = partial(decide, weight=weight)
+    best = decide(use="global", v_own=v_own, found=found, work=seen.early)
     errors: dict[str, float | None] = {"global": best.error}
     chosen, limit = (maps[0], first), _BETTER * best.error
 
     # --- The other ones, unless their eye paths alone are too dear ---
     light = own + seen.later
     more = within(light, light, weight) - v_own
-    bare = decide("none", weight, v_own, later=more)
+    bare = decide(use="none", v_own=v_own, later=more)
     if bare.error < limit:
         maps = [caustics(map_) for map_ in maps]
         any_ = replace(seen.points, caustic=dr.full(mi.Bool, False, dr.width(seen.points.lane)))
         found = read(maps, any_, lambda _: weight)
-        plan = decide("caustic", weight, v_own, found, later=more)
+        plan = decide(use="caustic", v_own=v_own, found=found, later=more)
         errors["caustic"] = plan.error
         if plan.error < limit:
             best, chosen, limit = plan, (maps[0], any_), plan.error
@@ -154,7 +166,7 @@ def look(
             if _has_found(seen.caustic, found.light, weight):
                 light = light + seen.caustic
                 more = within(light, light, weight) - v_own
-                plan = decide("none", weight, v_own, later=more)
+                plan = decide(use="none", v_own=v_own, later=more)
                 errors["none"] = plan.error
                 if plan.error < limit:
                     best, chosen = plan, (None, None)
@@ -167,17 +179,17 @@ def _survey(plan: Plan, errors, counts, map_, points) -> Survey:
         for v in (plan.share, plan.widths)
     )
     return Survey(
-        plan.use,
-        errors,
-        plan.each,
-        share,
-        plan.light_paths,
-        counts,
-        widths,
-        plan.aim,
-        plan.lobes,
-        map_,
-        points,
+        use=plan.use,
+        errors=errors,
+        each=plan.each,
+        share=share,
+        light_paths=plan.light_paths,
+        counts=counts,
+        widths=widths,
+        aim=plan.aim,
+        lobes=plan.lobes,
+        map=map_,
+        points=points,
     )
 
 
@@ -187,7 +199,7 @@ def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray |
     if plan.each < FEW:
         return None
     fine, coarse = Tiles.of(sensor, FINE), plan.tiles
-    sampler, ray, lane = _pairs(sensor, fine, seed, 5)
+    sampler, ray, lane = _pairs(sensor, fine, seed, PILOT_FINE)
     # Kernels as those of the passes, which leave gather points.
     scene = replace(scene, chosen=plan.use, footprint=footprint.of(sensor, 1.0))
     few = dr.full(mi.Float, LEAST_SHARE, fine.lanes)
@@ -229,7 +241,7 @@ class _Seen:
 
 
 def _trace(scene: Prepared, sensor, tiles: Tiles, seed: int) -> _Seen:
-    sampler, ray, _ = _pairs(sensor, tiles, seed, 3)
+    sampler, ray, _ = _pairs(sensor, tiles, seed, PILOT_PAIRS)
     scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
     vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
 

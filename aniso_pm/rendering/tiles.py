@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from .allotment import LEAST, MOST, in_proportion
-from .film import sampled_size
-from .prepared import PILOT, stream_seed
+from .film import border, sampled_size
+from .prepared import PILOT, PILOT_PIXELS, stream_seed
 
 # Tiles of a picture at most: those that read the photon map, and those that see what eye paths
 # find by themselves; stratified samples of each half of the pair in a tile's pixel.
@@ -56,12 +56,10 @@ class Tiles:
         """On the film, of all lanes, tiles row by row."""
         film = sensor.film()
         tile = dr.arange(mi.UInt32, self.lanes) // (2 * SAMPLES)
-        a, b = mi.sample_tea_32(tile, dr.opaque(mi.UInt32, stream_seed(seed, PILOT, 4)))
+        a, b = mi.sample_tea_32(tile, dr.opaque(mi.UInt32, stream_seed(seed, PILOT, PILOT_PIXELS)))
         x = dr.minimum((tile % self.across) * self.edge + a % self.edge, self.width - 1)
         y = dr.minimum((tile // self.across) * self.edge + b % self.edge, self.height - 1)
-        border = (self.width - film.crop_size().x) // 2
-        corner = film.crop_offset()
-        corner = mi.ScalarPoint2f(corner.x - border, corner.y - border)
+        corner = mi.ScalarPoint2f(film.crop_offset() - border(film))
         return mi.Point2f(mi.Float(x), mi.Float(y)) + corner + sampler.next_2d()
 
     def grid(self, pairs) -> np.ndarray:
@@ -124,7 +122,7 @@ def _trusted(noise):
 
 
 _BINOMIAL = np.array([1, 4, 6, 4, 1]) / 16
-# Σ w² of the weights of ``_smooth``.
+# Σ w² of the weights of ``smooth``, once.
 _SQUARED_WEIGHTS = float((_BINOMIAL**2).sum() ** 2)
 
 

@@ -22,10 +22,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .rays import MITSUBA_OFFSET
+
 # What rounding of points and normals may come to.
 _WRONG = 1e-3
-# Mitsuba's own distance of rays from the surface that they leave, relative to 1 + |p|.
-_OFFSET = 1500 * 2.0**-24
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Amends:
         centre = mi.Point3f(column(self.centre))
         out = dr.normalize(ray.o - centre)
         p = centre + radius * out
-        o = p + out * dr.mulsign(_OFFSET * (1 + dr.max(dr.abs(p))), dr.dot(out, d))
+        o = p + out * dr.mulsign(MITSUBA_OFFSET * (1 + dr.max(dr.abs(p))), dr.dot(out, d))
         ray = mi.Ray3f(ray)
         ray.o, ray.d = dr.select(turned, o, ray.o), dr.select(turned, d, ray.d)
         return ray, flux * dr.gather(mi.Float, self.factor, emitter, active)

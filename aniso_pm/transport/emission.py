@@ -190,7 +190,7 @@ def _spectrum(emitter, si, active):
 def prepare(scene) -> Emission:
     """Measure the power of every emitter of a scene with at least one.
 
-    Raises ValueError for an emitter that cannot start light paths.
+    Raises Unsupported for an emitter that cannot start light paths.
     """
     refuse(scene)
     environment = None

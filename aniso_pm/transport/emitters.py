@@ -11,29 +11,30 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import Unsupported
 from ..ndf import children
 
 _ROUNDING = 1e-3
 
 
 def refuse(scene):
-    """Raise ValueError for the first emitter of a scene that cannot start light paths."""
+    """Raise Unsupported for the first emitter of a scene that cannot start light paths."""
     for emitter in scene.emitters():
         kind = emitter.class_name()
         if kind == "TimedSunskyEmitter":
-            raise ValueError(
+            raise Unsupported(
                 f'aniso_pm: emitter "{emitter.id()}" is a timed_sunsky, from which Mitsuba cannot '
                 'trace light (its sample_ray raises); use "sunsky" for one point in time'
             )
         if mi.is_spectral and kind == "Projector":
-            raise ValueError(
+            raise Unsupported(
                 f'aniso_pm: emitter "{emitter.id()}" is a projector, whose light cannot be '
                 "evaluated at given wavelengths; use an RGB variant"
             )
         if mi.is_spectral and kind == "SpotLight":
             texture = children(emitter).get("texture")
             if texture is not None and texture.class_name() != "UniformSpectrum":
-                raise ValueError(
+                raise Unsupported(
                     f'aniso_pm: emitter "{emitter.id()}" is a spot with a "texture", whose light '
                     "cannot be evaluated at given wavelengths; use an RGB variant"
                 )
@@ -41,7 +42,7 @@ def refuse(scene):
         if kind in ("Projector", "DirectionalEmitter") and np.abs(lengths - 1).max() > _ROUNDING:
             refuse_scale(emitter)
         if kind == "SpotLight" and np.ptp(lengths) > _ROUNDING * lengths.max():
-            raise ValueError(
+            raise Unsupported(
                 f'aniso_pm: emitter "{emitter.id()}" is a spot with a "to_world" that scales '
                 "unevenly, under which Mitsuba's light paths and its emitter sampling disagree; "
                 "leave only rotations, mirrorings and one scale for all axes"
@@ -49,14 +50,14 @@ def refuse(scene):
         varies = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
         shape = emitter.get_shape()
         if varies and shape is not None and _strays(shape):
-            raise ValueError(
+            raise Unsupported(
                 f'aniso_pm: emitter "{emitter.id()}" has a texture on the shape "{shape.id()}", '
                 "where Mitsuba's emitter sampling finds other points, or the other side, than rays "
                 "meet; give the shape texture coordinates that do not overlap, and neither "
                 '"flip_normals" nor, on a sphere or cylinder, a "to_world" that turns or mirrors'
             )
         if shape is not None and shape.class_name() == "Cylinder" and _lies(shape)[1]:
-            raise ValueError(
+            raise Unsupported(
                 f'aniso_pm: emitter "{emitter.id()}" is on a cylinder with a "to_world" that '
                 "mirrors it, where Mitsuba's emitter sampling finds the other side than rays meet; "
                 'leave the mirroring out (scale by -1), and give "flip_normals" the other value'
@@ -64,8 +65,8 @@ def refuse(scene):
 
 
 def refuse_scale(emitter):
-    """Raise the ValueError about a ``to_world`` that scales."""
-    raise ValueError(
+    """Raise Unsupported about a ``to_world`` that scales."""
+    raise Unsupported(
         f'aniso_pm: emitter "{emitter.id()}" has a "to_world" that scales, under which Mitsuba\'s '
         "own sampling is wrong (directions that are not of unit length, or another brightness); "
         "leave only rotations (about axes of length 1) and mirrorings (scale by -1)"

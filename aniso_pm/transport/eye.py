@@ -15,8 +15,8 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     """Trace camera paths: (radiance, valid, GatherPoints or None).
 
     radiance  W/m²/sr: emission, direct light, and whatever the map does not stand for. NaN where
-              the throughput at a gather point is not finite. apart.Parts where use is "survey",
-              layers.Seen where somebody asks for layers.
+              the throughput at a gather point is not finite. survey_parts.Parts where use is
+              "survey", layers.Seen where somebody asks for layers.
     valid     did the ray meet anything but null surfaces and, if they are hidden, emitters?
               (alpha, as in ``path``)
     expected  gather points to make room for; with too few the same paths are traced again.

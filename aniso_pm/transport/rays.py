@@ -15,7 +15,9 @@ import mitsuba as mi
 _ULP = 2.0**-24
 # Rays of a million that meet the sphere, disc, cylinder or mesh that they leave: 6e4 with 4 ulps,
 # 10 (at a cylinder's open ends) with 16 and more.
-_ULPS, _MITSUBA_ULPS = 64, 1500
+_ULPS = 64
+# Mitsuba's own distance of rays from the surface that they leave, relative to 1 + |p|.
+MITSUBA_OFFSET = 1500 * _ULP
 
 
 def largest_coordinate(scene) -> float:
@@ -33,6 +35,6 @@ def spawn_ray(si, d, reach):
     reach: ``largest_coordinate`` of the scene, as a Dr.Jit array.
     """
     size = dr.max(dr.abs(si.p))
-    offset = dr.minimum(_MITSUBA_ULPS * _ULP * (1 + size), _ULPS * _ULP * (size + reach))
+    offset = dr.minimum(MITSUBA_OFFSET * (1 + size), _ULPS * _ULP * (size + reach))
     offset = dr.mulsign(offset, dr.dot(si.n, d))
     return mi.Ray3f(dr.fma(offset, mi.Vector3f(si.n), si.p), d, si.time, si.wavelengths)

@@ -9,10 +9,10 @@ global        the gathered part ends there, except for direct light; the walked 
 caustic       the map holds caustics alone: light → walked parts → gathered part. The path goes on
               with both parts, and drops emission and direct light that reach a gathered part over
               one walked part or more, because the map has them.
-final gather  "caustic" up to the first gathered part, "global" from there on.
+final_gather  "caustic" up to the first gathered part, "global" from there on.
 none          there is no map: path tracing.
-survey        "caustic", with what the other uses would have done told apart (see ``apart``): for
-              the pilot that chooses between them.
+survey        "caustic", with what the other uses would have done told apart (see
+              ``survey_parts``): for the pilot that chooses between them.
 
 Each light path is counted exactly once in all of them.
 """
@@ -29,8 +29,8 @@ from ..lobe_path import GlossyVertex, follow, no_lobe
 from ..map.receivers import gathered_part, read_receiver
 from ..map.spectra import channel_mean
 from . import layers
-from .apart import Apart
 from .rays import largest_coordinate, spawn_ray
+from .survey_parts import Apart
 from .thinning import Thinning
 
 

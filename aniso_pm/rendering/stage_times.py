@@ -20,6 +20,7 @@ class Clock:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
 
     def lap(self, stage: str):
+        """What was done since the last lap was ``stage``."""
         dr.sync_thread()
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
