@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import aniso_pm  # noqa: F401
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -262,6 +263,20 @@ def test_state_and_picture_are_saved_on_the_way(tmp_path):
     assert written and written[0][0][0] == 0
     assert State.load(path).passes == [[0, 5]]
     assert [p.name for p in Path(tmp_path).iterdir()] == ["a.state"]
+
+
+def test_what_others_do_with_the_picture_on_the_way_takes_no_time(tmp_path, monkeypatch, ticking):
+    monkeypatch.setattr(dr, "kernel_history", list)  # what is compiled here takes no time
+    plugin, written = integrator(passes=0, time=1.0), []
+
+    def write():
+        written.append(plugin.statistics["passes"])
+        ticking(100)
+
+    checkpoint = Checkpoint(tmp_path / "a.state", 0.0, on_write=write)
+    render(load(), plugin, 5, checkpoint=checkpoint)
+    assert plugin.statistics["passes"] > written[0]
+    assert State.load(tmp_path / "a.state").seconds == pytest.approx(1, abs=0.2)
 
 
 def test_checkpoints_of_films_with_alpha_crop_and_other_colours(tmp_path):

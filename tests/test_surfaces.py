@@ -7,9 +7,7 @@ import pytest
 from aniso_pm.map.photon_word import encode_normal, one_sheet
 
 
-@pytest.fixture(autouse=True)
-def _variant(variant_llvm_rgb):
-    pass
+pytestmark = pytest.mark.usefixtures("rgb", "without_pilot")
 
 
 def quadric(curvatures, count=20_000):
