@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from aniso_pm.map.photon_word import encode_normal, one_sheet
 
-
 pytestmark = pytest.mark.usefixtures("rgb", "without_pilot")
 
 
