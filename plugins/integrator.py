@@ -155,7 +155,8 @@ class AnisoPhotonMapper:
 
      * - rr_depth
        - |int|
-       - Path depth at which Russian roulette begins, for eye and light paths alike. (Default: 5)
+       - Path depth at which Russian roulette begins. Light paths begin theirs after three segments
+         at the latest. (Default: 5)
 
      * - max_memory
        - |float|

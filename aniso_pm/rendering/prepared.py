@@ -26,6 +26,10 @@ from .footprint import TRIED, Footprint
 from .needs import read_scene
 from .settings import Settings
 
+# Segments of light paths after which their roulette begins at the latest: photons of equal flux are
+# worth more than many faint ones (docs/performance.md).
+_LIGHT_ROULETTE = 3
+
 # Independent streams of random numbers (see ``stream_seed``).
 EYE, PROBE, PHOTONS, PILOT, COLOUR, THINNING = range(6)
 # Those of the pilot: its photons, eye paths of the automatic radius, random camera rays, pairs,
@@ -103,7 +107,7 @@ class Prepared(Decisions):
         plain = "marked" if self.light_layers else "ignored"
         options = photons.TraceOptions(
             max_depth=s.depth_limit - 1,
-            rr_depth=s.rr_depth,
+            rr_depth=min(s.rr_depth, _LIGHT_ROULETTE),
             caustics={"global": plain, "caustic": "only"}.get(self.use, "marked"),
             general=bool(self.needs.general),
             roughness=s.gather_roughness,
