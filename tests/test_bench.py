@@ -131,7 +131,7 @@ def test_a_plain_room_compiles_the_same_kernels_for_both_kernel_types():
 
 
 def test_a_map_takes_at_most_64_bytes_a_photon_at_its_peak():
-    found = memory.in_process("map_memory", 400_000)
+    found = memory.in_process("map_memory", 600_000)
     assert found["stored"] > 1_000_000
     # The measurement is not blind: at rest the map is there.
     assert found["at_rest"] * 0.9 <= found["resident"] / found["stored"] <= 64
@@ -145,11 +145,11 @@ def test_unknown_groups_are_named(capsys):
 
 
 def test_bench_prints_json(capsys):
-    assert cli.main(["bench", "startup", "kernels", "--quick", "--json"]) == 0
+    assert cli.main(["bench", "kernels", "--quick", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert {"name", "figure", "unit", "target", "met", "note"} == set(rows[0])
-    assert [row["name"].split(":")[0] for row in rows] == ["startup"] * 3 + ["kernels"] * 2
-    assert rows[3]["target"] == "<= 0" and rows[3]["met"] is True
+    assert [row["name"].split(":")[0] for row in rows] == ["kernels"] * 2
+    assert rows[0]["target"] == "<= 0" and rows[0]["met"] is True
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm.instruments.report import reference as references
+from conftest import slow
 
 SCENES = Path(__file__).parents[1] / "scenes"
 
@@ -37,7 +38,7 @@ def test_glass_balls_agree_with_their_reference_at_half_the_size():
     assert np.median(np.abs(image - small) / (small + 0.01)) < 0.05
 
 
-@pytest.mark.parametrize("name", ["teapot", "fry_pan"])
+@pytest.mark.parametrize("name", ["teapot", *slow("fry_pan")])
 def test_kernels_follow_the_metal_and_fallbacks_are_rare(name):
     scene = mi.load_file(str(SCENES / f"{name}.xml"), width="64", height="48")
     plugin = mi.load_dict({"type": "aniso_pm", "kernel": "anisotropic"})

@@ -27,7 +27,7 @@ def measure(quick: bool) -> Iterator[Row]:
     if not _STATUS.is_file():
         yield Row("memory", None, "bytes", None, "resident memory can be read on Linux only")
         return
-    for light_paths in (700_000,) if quick else (700_000, 3_000_000):
+    for light_paths in (1_200_000,) if quick else (1_200_000, 5_000_000):
         yield from _map_rows(in_process("map_memory", light_paths))
     if not quick:
         yield _large_row(in_process("large_memory"))
@@ -130,7 +130,7 @@ def large_memory() -> dict[str, Any]:
     integrator = {
         "type": "aniso_pm",
         "map": "global",
-        "photon_count": 8_000_000,
+        "photon_count": 14_000_000,
         "initial_radius": 0.002,
         "max_depth": 6,
     }
