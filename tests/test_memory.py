@@ -188,7 +188,7 @@ def test_what_cannot_fit_is_refused_before_it_starts():
     plugin = mi.load_dict(SMALL | {"max_memory": 0.1, "photon_count": 10_000_000})
     with pytest.raises(ValueError, match='"max_memory" is 0.1 GiB.*lower "photon_count"') as error:
         plugin.render(scene, spp=1)
-    assert "map of 3.9e+07 photons" in str(error.value)
+    assert "map of 2.3e+07 photons" in str(error.value)
     assert plugin.statistics == {}
 
 
