@@ -84,8 +84,8 @@ def test_samples_are_shared_evenly_and_open_ends_take_short_passes(parameters, s
 
 @pytest.mark.with_pilot
 def test_automatic_photon_count_balances_the_work_of_a_pass():
-    """Twice the eye samples, twice the light paths, which are work of the same order as eye paths in
-    a room where both are about as noisy."""
+    """Twice the eye samples, twice the light paths, which are work of the same order as eye paths
+    in a room where both are about as noisy."""
     scene = load(64)
     chosen = {}
     for spp in (16, 32):
