@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from aniso_pm.instruments import gallery
 from aniso_pm.rendering import pilot, plan
+from aniso_pm.rendering.film import border
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.tiles import SAMPLES, Tiles
@@ -89,6 +90,22 @@ def test_tiles_cover_every_pixel_once(edge):
     for y in range(7):
         for x in range(10):
             assert pixels[y, x] == (y // edge) * tiles.across + x // edge
+
+
+@pytest.mark.parametrize("offset", [0, 3])
+def test_positions_reach_over_a_border_that_the_film_samples(variant_llvm_rgb, offset):
+    film = {"type": "hdrfilm", "width": 32, "height": 24, "crop_width": 10, "crop_height": 8}
+    film |= {"crop_offset_x": offset, "crop_offset_y": offset, "sample_border": True}
+    sensor = mi.load_dict({"type": "perspective", "film": film | {"rfilter": {"type": "gaussian"}}})
+    tiles = Tiles.of(sensor, 4096)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, tiles.lanes)
+    found, edge = tiles.positions(sensor, 0, sampler).numpy(), border(sensor.film())
+    assert edge > 0
+    for values, size in zip(found, (10, 8), strict=True):
+        first = offset - edge
+        pixels = np.unique(np.floor(values)).astype(int)
+        np.testing.assert_array_equal(pixels, np.arange(first, first + size + 2 * edge))
 
 
 def test_variances_are_those_of_the_samples(variant_llvm_rgb):

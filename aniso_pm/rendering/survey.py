@@ -5,8 +5,7 @@ need more samples.
 How variances become decisions is told in ``plan``.
 
 *Use of the map.* Where it is open (``Prepared.undecided``), the eye paths of the pilot go on as in
-path tracing and tell apart what each use leaves to them (see ``survey_parts``). The use of the
-least
+path tracing and tell apart what each use leaves to them (see ``survey_parts``). That of the least
 
     bias² + (A/n + B/N) (n P (C + q C_g) + N C_p) / (M n P C_0)
 

@@ -59,7 +59,8 @@ class Tiles:
         a, b = mi.sample_tea_32(tile, dr.opaque(mi.UInt32, stream_seed(seed, PILOT, PILOT_PIXELS)))
         x = dr.minimum((tile % self.across) * self.edge + a % self.edge, self.width - 1)
         y = dr.minimum((tile // self.across) * self.edge + b % self.edge, self.height - 1)
-        corner = mi.ScalarPoint2f(film.crop_offset() - border(film))
+        # Unsigned numbers, which have no place left of the first pixel.
+        corner = mi.ScalarPoint2f(film.crop_offset()) - border(film)
         return mi.Point2f(mi.Float(x), mi.Float(y)) + corner + sampler.next_2d()
 
     def grid(self, pairs) -> np.ndarray:
