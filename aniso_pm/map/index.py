@@ -129,6 +129,14 @@ def build(positions, word) -> tuple[Index, Any]:
     positions: Point3f of finite points; word: UInt32 that is handed to the visitor of ``gather``
     with each point.
     """
+    return build_of([positions, word])
+
+
+def build_of(columns: list) -> tuple[Index, Any]:
+    """As ``build`` of [positions, word]. The list is emptied: columns that nobody else has make
+    room for the boxes (arguments of a call do not, before Python 3.11: the caller holds them)."""
+    positions, word = columns
+    columns.clear()
     count = dr.width(positions)
     _, extent = _cube(positions)
     order = curve_order(positions)
@@ -139,7 +147,6 @@ def build(positions, word) -> tuple[Index, Any]:
     points = dr.full(mi.Float, dr.nan, 4 * LEAF * used_leaves)
     dr.scatter(points, mi.Vector4f(positions.x, positions.y, positions.z, word), _iota(count))
     dr.eval(points, extent)
-    # A caller that keeps none of them makes room for the boxes.
     del positions, word
     give_back(count)
 

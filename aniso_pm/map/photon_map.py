@@ -95,7 +95,7 @@ def indexed(photons: Photons, stored: int, nothing: PhotonMap) -> PhotonMap:
     """``nothing``, a map without photons, with the first ``stored`` of the columns in order."""
     if stored == 0:
         return nothing
-    index, order = spatial.build(_cut(photons, "position", stored), _cut(photons, "word", stored))
+    index, order = spatial.build_of([_cut(photons, name, stored) for name in ("position", "word")])
     # What has been put in order is dropped before the next column is.
     direction, origins = None, nothing.origins
     if photons.direction is not None:
