@@ -95,7 +95,7 @@ def test_automatic_photon_count_balances_the_work_of_a_pass():
         assert s["photon_count_automatic"] and s["photon_count"] == s["photons_emitted"]
         light = s["photons_emitted"] + s["photons_stored"]
         gathers = s["gather_points"] / s["share_of_gathers"]  # were all eye paths to gather
-        # 0.73 with 3.6 photons a path; light paths that end sooner leave 2.2, and are a little more.
+        # 0.73 with 3.6 photons a path; light paths that end sooner leave 2.2, and are more.
         assert light == pytest.approx(0.63 * (s["eye_samples"] + gathers), rel=0.3)
         chosen[spp] = s["photon_count"]
     # Rather more: kernels shrink as there are more of them.
