@@ -153,6 +153,22 @@ def automatic_radius(scene: Prepared, rays, seed: int, map_=None) -> float:
     return radius_at(points, map_, scene, scene.settings.photon_count)
 
 
+@dr.syntax
+def _widened(photons_in, radius):
+    """Radii at which discs hold _ENOUGH photons, from the smallest ones on."""
+    looking = dr.full(mi.Bool, True, dr.width(radius))
+    step = mi.UInt32(0)
+    while looking:
+        found = photons_in(radius, looking)
+        # The number of photons grows with the area, which makes the last step exact.
+        exact = radius * dr.sqrt(_ENOUGH / mi.Float(dr.maximum(found, 1)))
+        enough = looking & (found >= _ENOUGH)
+        step += 1
+        looking &= ~enough & (step < _STEPS)
+        radius = dr.select(enough, exact, dr.select(looking, 2 * radius, radius))
+    return radius
+
+
 def radius_at(points, map_, scene: Prepared, light_paths: float) -> float:
     """Bandwidth (world units) at which kernels hold PHOTONS_PER_KERNEL photons of so many light
     paths, in the median over gather points (GatherPoints or None).
@@ -167,20 +183,13 @@ def radius_at(points, map_, scene: Prepared, light_paths: float) -> float:
     if count > _RAYS:
         points = take(points, dr.arange(mi.UInt32, _RAYS) * (count // _RAYS))
         count = _RAYS
-    radius = dr.full(mi.Float, _SMALLEST * extent, count)
-    looking = dr.full(mi.Bool, True, count)
-    dr.eval(looking, radius)
-    for _ in range(_STEPS):
+    smallest = dr.opaque(mi.Float, _SMALLEST * extent)
+
+    def photons_in(radius, active):
         disc = density.disc(points.n, radius)
-        _, found = density.estimate(map_, points, disc, radius, scene.gather_depth, looking)
-        # The number of photons grows with the area, which makes the last step exact.
-        exact = radius * dr.sqrt(_ENOUGH / mi.Float(dr.maximum(found, 1)))
-        enough = looking & (found >= _ENOUGH)
-        looking &= ~enough
-        radius = dr.select(enough, exact, dr.select(looking, 2 * radius, radius))
-        dr.eval(looking, radius)
-        if not dr.any(looking):
-            break
+        return density.estimate(map_, points, disc, radius, scene.gather_depth, active)[1]
+
+    radius = _widened(photons_in, smallest + dr.zeros(mi.Float, count))
     median = _weighted_median(radius.numpy())
     more_photons = light_paths / map_.emitted
     return min(median * math.sqrt(PHOTONS_PER_KERNEL / _ENOUGH / more_photons), LARGEST * extent)

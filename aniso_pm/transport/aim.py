@@ -145,6 +145,11 @@ def _chances(score, parent, work, volume):
     return (1 - _EVEN) * root / root.sum() + _EVEN * volume
 
 
+def _root(score, work):
+    """√(Σq Σc), either of which rounding may have left below 0."""
+    return np.sqrt(np.maximum(score, 0) * np.maximum(work, 0))
+
+
 def _boxes(numbers, score, more_work, idle_work):
     """(low, size, box of each path, score by the box that each was a half of). idle_work: of all
     paths if they were idle; more_work: than that, of each of these."""
@@ -153,43 +158,46 @@ def _boxes(numbers, score, more_work, idle_work):
     box = np.zeros(len(score), np.int64)
     whole = np.sqrt(score.sum() * (more_work.sum() + idle_work))
     is_open = np.array([True])  # may the box be halved?
+    place = numbers.T.copy()  # of each path in its box, 0 to 1
+    path = np.arange(len(score))
+
+    def in_boxes(values):
+        return np.bincount(box, values, len(low))
+
     for _ in range(_HALVINGS):
         # --- What halving would gain ---
-        inside = np.flatnonzero(is_open[box])
-        count = int(is_open.sum())
-        at = (np.cumsum(is_open) - 1)[box[inside]]  # among the open boxes
-        q, c = score[inside], more_work[inside]
-        sums, squares = np.bincount(at, q, count), np.bincount(at, q**2, count)
-        effective = sums**2 / np.maximum(squares, 1e-300)
-        middle, idle = (low + 0.5 * size)[is_open], idle_work * size[is_open].prod(1)
-        upper = np.empty((5, len(inside)), bool)
-        roots = np.empty((5, count))
-        for k in range(5):
-            upper[k] = numbers[inside, k] >= middle[at, k]
-            key = 2 * at + upper[k]
-            of_score = np.bincount(key, q, 2 * count).reshape(count, 2)
-            of_work = np.bincount(key, c, 2 * count).reshape(count, 2) + 0.5 * idle[:, None]
-            roots[k] = np.sqrt(of_score * np.maximum(of_work, 0)).sum(1)
+        sums, works = in_boxes(score), in_boxes(more_work)
+        idle = idle_work * size.prod(1)
+        effective = sums**2 / np.maximum(in_boxes(score**2), 1e-300)
+        upper = place >= 0.5
+        of_score, of_work = (
+            np.array([in_boxes(values * half) for half in upper]) for values in (score, more_work)
+        )
+        roots = _root(of_score, of_work + 0.5 * idle)
+        roots += _root(sums - of_score, works - of_work + 0.5 * idle)
         best = roots.argmin(0)
-        root = np.sqrt(sums * np.maximum(np.bincount(at, c, count) + idle, 0))
+        root = _root(sums, works + idle)
         gain = root - roots.min(0)
         chance = _CHANCE * root / np.maximum(effective, 1)
         split = (effective >= _ENOUGH) & (gain > np.maximum(_LEAST_GAIN * whole, chance))
 
         # --- Halve: the lower half stays in its place, the upper ones come after all ---
-        which = np.flatnonzero(is_open)[split]
+        which = np.flatnonzero(is_open & split)
         if not len(which):
             break
-        dimension, new = best[split], len(low) + np.arange(len(which))
+        is_open = np.zeros(len(low) + len(which), bool)
+        dimension, new = best[which], np.arange(len(low), len(is_open))
+        is_open[which] = is_open[new] = True
         size[which, dimension] *= 0.5
         low, size = np.concatenate([low, low[which]]), np.concatenate([size, size[which]])
         low[new, dimension] += size[new, dimension]
-        inherited[which] = 0.5 * sums[split]
+        inherited[which] = 0.5 * sums[which]
         inherited = np.concatenate([inherited, inherited[which]])
-        is_open = np.zeros(len(low), bool)
-        is_open[which] = is_open[new] = True
-        target = np.zeros(count, np.int64)
-        target[split] = new
-        moves = upper[best[at], np.arange(len(inside))] & split[at]
-        box[inside[moves]] = target[at[moves]]
+        target = np.arange(len(best))
+        target[which] = new
+        across = best[box]
+        above = upper[across, path]
+        # Nobody asks any more for places in boxes that are not halved.
+        place[across, path] = 2 * place[across, path] - above
+        box = np.where(above, target[box], box)
     return low, size, box, inherited
