@@ -12,6 +12,7 @@ import mitsuba as mi
 from ..map import density, photon_word
 from ..map.photon_map import flux_bytes
 from ..transport import emission, layers
+from ..transport.uses import Use
 from .needs import Needs
 from .settings import Settings
 
@@ -25,7 +26,7 @@ class Decisions:
     settings: Settings
     hide_emitters: bool
     emission: emission.Emission | None
-    chosen: str | None = None  # use of the map that a pilot has found best, see ``undecided``
+    chosen: Use | None = None  # use of the map that a pilot has found best, see ``undecided``
     lobes_matter: bool = True  # kernels that follow lobes: a pilot may find that they do not
 
     @property
@@ -61,8 +62,8 @@ class Decisions:
         return automatic and self.use == "global" and not self.needs.unseen and not self.chosen
 
     @property
-    def use(self) -> str:
-        """How eye paths use the map; see ``walk``. As long as nobody has chosen, ``auto`` is
+    def use(self) -> Use:
+        """How eye paths use the map; see ``uses``. As long as nobody has chosen, ``auto`` is
         "global" where there is anything to choose."""
         if self.chosen:
             return self.chosen

@@ -19,6 +19,7 @@ from ..map import density
 from ..map.gather_points import take
 from ..map.photon_map import EMPTY
 from ..transport import aim
+from ..transport.uses import Use
 from . import survey
 from .film import one_each, wavelengths
 from .prepared import PILOT, PILOT_CAMERA, PILOT_EYE, Prepared, stream_seed
@@ -54,7 +55,7 @@ def camera_rays(sensor, seed: int):
 class Settled:
     """What a rendering needs to know before its first pass, given or chosen.
 
-    use     of the map (see ``walk``).
+    use     of the map (see ``uses``).
     errors  relative MSE that each use promises, where there was a choice (see ``survey``).
     count   light paths per pass.
     radius  bandwidth of the first pass, world units.
@@ -66,7 +67,7 @@ class Settled:
     lobes   part of the error that kernels make which follow lobes (see ``plan``).
     """
 
-    use: str
+    use: Use
     errors: dict[str, float | None]
     count: int
     radius: float

@@ -40,6 +40,7 @@ from typing import Any
 import numpy as np
 
 from ..transport import aim
+from ..transport.uses import Use
 from . import footprint
 from .allotment import FEW
 from .tiles import SAMPLES, Tiles, smooth
@@ -92,7 +93,7 @@ class Plan:
     part of the error that kernels make which follow lobes."""
 
     tiles: Tiles
-    use: str
+    use: Use
     each: int
     share: np.ndarray
     light_paths: float
@@ -127,7 +128,7 @@ class Plan:
         filtered: float,
         total: float,
         whole,
-        use: str,
+        use: Use,
         weight,
         v_own,
         found: Found | None = None,

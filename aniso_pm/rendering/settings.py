@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 from ..kernel import RULES
 from ..transport import layers
@@ -23,7 +24,7 @@ class Settings:
     epsilon: float = 0.02
     guard: bool = True
     max_aspect: float = 24.0
-    map: str = "auto"
+    map: Literal["global", "caustic", "auto"] = "auto"
     final_gather: bool = False
     gather_roughness: float = 0.2
     photon_count: int = 0

@@ -32,6 +32,7 @@ from ..map.spectra import channel_mean
 from ..transport import aim
 from ..transport.survey_parts import Parts
 from ..transport.thinning import Thinning
+from ..transport.uses import Use
 from . import footprint
 from .allotment import FEW
 from .film import noise_share, rays_through, wavelengths
@@ -65,7 +66,7 @@ _FOUND, _HITS = 0.7, 64
 class Survey:
     """What was found.
 
-    use          of the map (see ``walk``).
+    use          of the map (see ``uses``).
     errors       relative MSE that each use promises, by its name, where there was a choice; None
                  where path tracing has not found what the map holds.
     each         eye samples of a pixel in a pass, in the mean: fewer than asked for where light
@@ -79,7 +80,7 @@ class Survey:
     map, points  a map of that use, and where eye paths read it (GatherPoints); None where none do.
     """
 
-    use: str
+    use: Use
     errors: dict[str, float | None]
     each: int
     share: np.ndarray

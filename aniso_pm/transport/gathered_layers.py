@@ -16,11 +16,12 @@ import mitsuba as mi
 from ..map import density
 from ..map.gather_points import GatherPoints
 from .layers import Light
+from .uses import Use
 
 
 def split(
     L,
-    use: str,
+    use: Use,
     unseen: bool,
     photons,
     points: GatherPoints,
@@ -32,7 +33,7 @@ def split(
 ) -> Light:
     """``L``, which ``density.estimate`` has found with the other arguments, in parts.
 
-    use     of the map, see ``walk``.
+    use     of the map, see ``uses``.
     unseen  does the map hold light that came straight from an emitter?
     """
     later: Any = mi.Bool(False) if points.later is None else points.later

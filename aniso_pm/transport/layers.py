@@ -27,6 +27,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..map.receivers import gathered_part
+from .uses import Use
 
 LIGHT = ("direct", "caustic", "indirect")
 SURFACE = ("albedo", "normal", "depth", "position")
@@ -114,10 +115,10 @@ class Trail:
         self.light.caustic[active] += value * self.caustic
         self.light.indirect[active] += value * (1 - self.walked - self.once)
 
-    def direct_light(self, use, bsdf, si, wo, value, f, roughness, scattered, active):
+    def direct_light(self, use: Use, bsdf, si, wo, value, f, roughness, scattered, active):
         """Light by emitter sampling at a vertex: ``value`` in all, with the BSDF's value f.
 
-        use, scattered  of the walk (see ``walk``): where paths go on with one part of a BSDF, a
+        use, scattered  of the walk (see ``uses``): where paths go on with one part of a BSDF, a
                         part that has not been chosen is not there.
         """
         if self.light is None:
@@ -132,7 +133,7 @@ class Trail:
         self.light.caustic[active] += self.once * (value - gathered)
         self.light.indirect[active] += self.once * gathered + (1 - self.walked - self.once) * value
 
-    def scatter(self, use, g, scattered):
+    def scatter(self, use: Use, g, scattered):
         """The path goes on. g: share of the gathered part; ``scattered`` as it was so far."""
         if self.light is None:
             return

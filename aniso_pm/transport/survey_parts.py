@@ -1,6 +1,6 @@
 """What the survey's eye paths tell apart.
 
-They walk with use "caustic" (see ``walk``). What is found beyond a gathered part would be the map's
+They walk with use "caustic" (see ``uses``). What is found beyond a gathered part would be the map's
 with use "global"; what is found over walked parts beyond a gathered part is in both maps.
 """
 

@@ -1,20 +1,8 @@
 """The walk of an eye path from vertex to vertex.
 
 A path is traced as Mitsuba's ``path`` does (emitter sampling and BSDF sampling, combined by the
-power heuristic). At a receiver the gathered part of its BSDF (see ``receivers``) leaves a gather
-point: what arrives there over two path segments or more is the photon map's. What is left for the
-path depends on how the map is used:
-
-global        the gathered part ends there, except for direct light; the walked part goes on.
-caustic       the map holds caustics alone: light → walked parts → gathered part. The path goes on
-              with both parts, and drops emission and direct light that reach a gathered part over
-              one walked part or more, because the map has them.
-final_gather  "caustic" up to the first gathered part, "global" from there on.
-none          there is no map: path tracing.
-survey        "caustic", with what the other uses would have done told apart (see
-              ``survey_parts``): for the pilot that chooses between them.
-
-Each light path is counted exactly once in all of them.
+power heuristic). What it leaves to the photon map at a receiver, and where it goes on, depends on
+how the map is used (see ``uses``).
 """
 
 from __future__ import annotations
@@ -32,13 +20,14 @@ from . import layers
 from .rays import largest_coordinate, spawn_ray
 from .survey_parts import Apart
 from .thinning import Thinning
+from .uses import Use
 
 
 @dataclass  # not frozen: Dr.Jit writes back whatever a loop mentions
 class WalkOptions:
     """Decisions for one scene; what is off is not traced.
 
-    use            see above.
+    use            of the map.
     max_depth      segments of the longest light path.
     rr_depth       segments after which Russian roulette begins.
     min_segments   segments of the shortest light path that the map holds (2; 1 where the scene has
@@ -55,7 +44,7 @@ class WalkOptions:
     surface        keep what is seen.
     """
 
-    use: str
+    use: Use
     max_depth: int
     rr_depth: int
     min_segments: int
