@@ -79,7 +79,7 @@ def test_indirect_light_agrees_with_path_within_one_percent(room, kernel):
 @pytest.mark.parametrize("depth", [1, 2, 3, 4, 5, 6])
 @pytest.mark.parametrize("room", ROOMS)
 def test_every_max_depth_agrees_within_one_percent(room, depth):
-    spp = 2048 if room == "ball" else 256
+    spp = 16384 if room == "ball" else 256
     assert_agrees(room, "lobe", depth, 400_000, 8, spp, range(6), 0.01)
 
 
