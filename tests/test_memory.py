@@ -143,7 +143,7 @@ def test_parts_of_the_film_are_the_picture_of_the_whole(monkeypatch, film, sampl
     whole, plugin = picture(definition, max_memory=16.0)
     again, _ = picture(definition, seed=1, max_memory=16.0)
     apart = lambda image: np.quantile(np.abs(image - whole), 0.8)  # noqa: E731 (no fireflies)
-    scene, border = plugin._last_map[1], 4 if film else 0
+    scene, border = prepare(mi.load_dict(definition), plugin.settings, False), 4 if film else 0
     stored = 40_000 * pilot.photons_per_path(scene, 0)
     job = memory.Job(stored, (36 + border) ** 2, 4, False, 16 * (36 + border) ** 2)
     monkeypatch.setattr(memory, "SMALLEST", 500)

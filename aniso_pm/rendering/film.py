@@ -50,8 +50,15 @@ def rays_through(sensor, sampler, position, wavelength):
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     u = dr.opaque(mi.Float, wavelength)
-    ray, weight = sensor.sample_ray(time, u, normalised, aperture)
+    ray, weight = sample_ray(sensor, time, u, normalised, aperture)
     return one_each(ray, dr.width(position)), weight
+
+
+def sample_ray(sensor, time, wavelength, position, aperture):
+    """(ray, weight) of a sensor. Mitsuba's integrators ask for ray differentials, so that there are
+    sensors which know nothing else (``irradiancemeter``)."""
+    ray, weight = sensor.sample_ray_differential(time, wavelength, position, aperture)
+    return mi.Ray3f(ray), weight
 
 
 def one_each(ray, count: int):
@@ -65,7 +72,8 @@ def one_each(ray, count: int):
 def wavelengths(sensor, u):
     """Wavelengths (nm) that a wavelength sample stands for, the same for all rays of a sensor."""
     centre = mi.Point2f(0.5)
-    ray, _ = sensor.sample_ray(mi.Float(sensor.shutter_open()), mi.Float(u), centre, centre)
+    time = mi.Float(sensor.shutter_open())
+    ray, _ = sample_ray(sensor, time, mi.Float(u), centre, centre)
     return ray.wavelengths
 
 

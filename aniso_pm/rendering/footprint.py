@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import own
+from .film import sample_ray
 
 # Widest kernels, in pixels, that pilots have tried (see ``survey``).
 TRIED = 8.0
@@ -65,23 +66,28 @@ class Footprint:
         return replace(self, pixel=pixel) if dr.width(self.widths) > 1 else self
 
 
-def of(sensor, radius: float, widths=1.0) -> Footprint:
+def of(sensor, radius: float, widths=1.0) -> Footprint | None:
     """Footprints of the pixels of a sensor, seen in its middle; kernels that are never narrower
-    until ``in_pass`` says by how much.
+    until ``in_pass`` says by how much. None where pixels have no width: all rays are one
+    (``radiancemeter``), or the sensor chooses them without the film (``distant``).
 
     radius  bandwidth r_0 of the first pass, world units.
     widths  of kernels in pixels: a number or a flat array, one for each sampled pixel.
     """
     centre, aperture = mi.Point2f(0.5), mi.Point2f(0.5)
     time = mi.Float(sensor.shutter_open())
-    ray, _ = sensor.sample_ray(time, mi.Float(0.5), centre, aperture)
-    size = sensor.film().size()
+    size = sensor.film().crop_size()  # what positions are relative to
     # Neighbours along both axes: the wider one counts.
     start = spread = mi.Float(0)
-    for step in (mi.Vector2f(1 / size[0], 0), mi.Vector2f(0, 1 / size[1])):
-        beside, _ = sensor.sample_ray(time, mi.Float(0.5), centre + step, aperture)
+    for half in (mi.Vector2f(0.5 / size[0], 0), mi.Vector2f(0, 0.5 / size[1])):
+        ray, beside = (
+            sample_ray(sensor, time, mi.Float(0.5), centre + side, aperture)[0]
+            for side in (-half, half)
+        )
         start = dr.maximum(start, dr.norm(beside.o - ray.o))
         spread = dr.maximum(spread, dr.norm(beside.d - ray.d))
+    if float(start[0]) == 0 and float(spread[0]) == 0:
+        return None
     unit = dr.rcp(dr.opaque(mi.Float, radius))
     width = own(mi.Float, np.array(widths, np.float32))
     found = Footprint(start * unit, spread * unit, mi.Float(1), width)

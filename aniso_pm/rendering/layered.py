@@ -68,7 +68,10 @@ class Layered:
                 light = dr.select(finite, getattr(seen.light, name), 0) * ray_weight
                 return _rgb(light, ray.wavelengths)
             if name == "albedo":
-                return _rgb(dr.select(finite, seen.surface.albedo, 0), ray.wavelengths)
+                albedo = dr.select(finite, seen.surface.albedo, 0)
+                if mi.is_spectral:  # a value over the density of its wavelengths, as radiance is
+                    albedo *= ray_weight
+                return _rgb(albedo, ray.wavelengths)
             if name == "radius":
                 return _over_points(gathered, lanes.count)
             value = getattr(seen.surface, name)

@@ -211,7 +211,9 @@ def _group_available(directory: Path, limit: str, usage: str, cached: str) -> fl
         if maximum == "max":
             return math.inf
         used = int((directory / usage).read_text())
-        statistics = dict(line.split() for line in (directory / "memory.stat").open())
+        statistics = dict(
+            line.split() for line in (directory / "memory.stat").read_text().splitlines()
+        )
     except OSError:
         return math.inf
     return max(0, int(maximum) - used + int(statistics.get(cached, 0)))

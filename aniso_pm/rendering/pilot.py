@@ -20,8 +20,8 @@ from ..map.gather_points import take
 from ..map.photon_map import EMPTY
 from ..transport import aim
 from ..transport.uses import Use
-from . import survey
-from .film import one_each, wavelengths
+from . import footprint, survey
+from .film import one_each, sample_ray, wavelengths
 from .prepared import PILOT, PILOT_CAMERA, PILOT_EYE, Prepared, stream_seed
 
 # Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
@@ -45,9 +45,8 @@ def camera_rays(sensor, seed: int):
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, PILOT_CAMERA)), _RAYS)
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    ray, _ = sensor.sample_ray(
-        mi.Float(sensor.shutter_open()), mi.Float(0.5), sampler.next_2d(), aperture
-    )
+    time = mi.Float(sensor.shutter_open())
+    ray, _ = sample_ray(sensor, time, mi.Float(0.5), sampler.next_2d(), aperture)
     return one_each(ray, _RAYS)
 
 
@@ -104,6 +103,10 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
         else EMPTY
         for k in (0, 1)
     ]
+    if not radius and maps[0].stored and footprint.of(sensor, 1.0) is None:
+        # Nothing says how wide pixels are: one radius for all.
+        usual = scene.with_(photon_count=count or USUAL)
+        radius = automatic_radius(usual, camera_rays(sensor, seed), seed, maps[0])
     found = survey.look(scene, sensor, radius or None, seed, each, exactly, maps, count)
     count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
     # Aimed photons are closer together where they show.

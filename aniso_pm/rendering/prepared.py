@@ -135,11 +135,11 @@ class Prepared(Decisions):
         return map_
 
     def trace(
-        self, sampler, ray, expected: int = 0, see=None, thinning=None, for_layers: bool = False
+        self, sampler, ray, expected: int = 0, watch=None, thinning=None, for_layers: bool = False
     ):
         """(radiance, valid, GatherPoints or None) of camera rays; see ``eye.trace``, and
-        ``walk`` for ``see``, and ``Thinning``. for_layers: keep what layers need that are
-        asked for."""
+        ``Thinning``. watch: returns ``walk``'s ``see``, whenever all paths are traced (again).
+        for_layers: keep what layers need that are asked for."""
         s = self.settings
         options = WalkOptions(
             use=self.use,
@@ -157,7 +157,9 @@ class Prepared(Decisions):
             light=for_layers and self.light_layers,
             surface=for_layers and self.surface_layers,
         )
-        launch = partial(self.launch.eye, see=see) if see else self.launch.eye
+        launch = self.launch.eye
+        if watch:
+            launch = lambda *wavefront: self.launch.eye(*wavefront, see=watch())  # noqa: E731
         return eye.trace(self.scene, sampler, ray, options, expected, launch)
 
     def gather(

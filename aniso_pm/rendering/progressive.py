@@ -97,6 +97,7 @@ class Run:
             earlier.identity if earlier else {},
         )
         self.clock.lap("pilot")
+        self.stopping.count_compilation()
         self.tracer = Tracer(self.decided, self.sensor, self.seed, self.clock)
         if checkpoint:
             self.identity = self.decided.identity(self.sensor, self.seed)

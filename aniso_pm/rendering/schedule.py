@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from .allotment import FEW
+from .allotment import FEW, MOST
 from .prepared import COLOUR, stream_seed
 from .settings import Settings
 
@@ -61,6 +61,12 @@ def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Sh
         raise ValueError(
             f"aniso_pm: {spp} samples per pixel cannot be shared by {passes} passes; "
             f'raise the sample count to {passes} or lower the parameter "passes"'
+        )
+    last, largest = first_pass + max(passes, 1), int(2**32 / MOST)
+    if last * (each + bool(rest)) > largest:
+        raise ValueError(
+            f"aniso_pm: passes {first_pass} to {last - 1} of {each} samples per pixel go beyond "
+            f"sample {largest} of a pixel; count them from a smaller number, with another seed"
         )
     text = f"{spp} by {passes} from pass {first_pass}" if rest else str(each)
     return Shares(each, range(first_pass, first_pass + rest), text)

@@ -234,6 +234,7 @@ class Checkpoint:
     on_write: Callable[[], Any] | None = None
 
     def __post_init__(self):
+        self.path = Path(self.path)
         self._written = time.perf_counter()
         self._cost = 0.0
 

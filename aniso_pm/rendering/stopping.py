@@ -65,11 +65,16 @@ class Stopping:
         if self._history:
             self._close_history()
 
+    def count_compilation(self):
+        """What has been compiled so far is no rendering."""
+        if self._history:
+            kernels = [k for k in dr.kernel_history() if "backend_time" in k]
+            self._compiling += sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
+            dr.kernel_history_clear()
+
     def _close_history(self):
-        kernels = [k for k in dr.kernel_history() if "backend_time" in k]
-        self._compiling += sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
+        self.count_compilation()
         dr.set_flag(dr.JitFlag.KernelHistory, False)
-        dr.kernel_history_clear()
         self._history = False
 
     @property

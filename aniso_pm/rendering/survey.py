@@ -243,14 +243,20 @@ class _Seen:
 def _trace(scene: Prepared, sensor, tiles: Tiles, seed: int) -> _Seen:
     sampler, ray, _ = _pairs(sensor, tiles, seed, PILOT_PAIRS)
     scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
-    vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
+    vertices = early = mi.Float(0)
 
-    def see(lane, depth, si, bsdf, bs, active, scattered):
-        dr.scatter_add(vertices, mi.Float(1), lane, active)
-        dr.scatter_add(early, mi.Float(1), lane, active & ~scattered)
+    def watch():
+        nonlocal vertices, early
+        vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
+
+        def see(lane, depth, si, bsdf, bs, active, scattered):
+            dr.scatter_add(vertices, mi.Float(1), lane, active)
+            dr.scatter_add(early, mi.Float(1), lane, active & ~scattered)
+
+        return see
 
     room = 3 * tiles.lanes if scene.use == "survey" else 0
-    L, _, points = scene.trace(sampler, ray, room, see=see)
+    L, _, points = scene.trace(sampler, ray, room, watch=watch)
     later = caustic = mi.Float(0)
     if isinstance(L, Parts):
         L, later, caustic = L.radiance, L.later, L.caustic
@@ -271,6 +277,7 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
         if not radius:  # kernels as wide as they are told to be
             size = 0.1 * scene.extent
             free = footprint.of(sensor, size, width)
+            assert free  # else a radius is given (see ``pilot.settle``)
             free = replace(free, least=dr.opaque(mi.Float, 1e-6))
             scene = replace(scene, footprint=free)
         scores: list[Any] = [None, None]

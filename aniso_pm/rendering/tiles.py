@@ -78,7 +78,7 @@ class Tiles:
         """Samples of each pixel, in proportion to √(variance/work), from those of pairs; None where
         even ones are as good: rare bright samples say little about where the next ones will be."""
         noise, work = self.grid(noise), self.grid(work)
-        if not noise.mean() > 0:
+        if noise.size < 2 or not noise.mean() > 0:
             return None
         # What every other tile says, tried on the tiles between them.
         chess = np.indices(noise.shape).sum(0) % 2

@@ -129,8 +129,10 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefro
         for first in range(0, photon_count, wavefront):
             count = min(wavefront, photon_count - first)
             sampler = _random(seed, first // wavefront, count)
+            # A number would be part of what is recorded, and replayed for other wavefronts.
+            share = dr.opaque(mi.Float, 1 / count)
             photons, stored, rejected = launch(
-                scene, source, sampler, options, photons, stored, rejected, room
+                scene, source, sampler, share, options, photons, stored, rejected, room
             )
             dr.eval(photons, stored, rejected)
         count = int(stored[0])
@@ -160,8 +162,9 @@ def _first_numbers(sampler):
     return sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
 
 
-def light_paths(scene, source, sampler, options, photons, stored, rejected, room):
-    """One wavefront of light paths into the buffers; returns what it has changed."""
+def light_paths(scene, source, sampler, share, options, photons, stored, rejected, room):
+    """One wavefront of light paths into the buffers; returns what it has changed. share: of one
+    path in the wavefront."""
 
     def reject(active):
         dr.scatter_add(rejected, mi.UInt32(1), mi.UInt32(0), active)
@@ -177,18 +180,18 @@ def light_paths(scene, source, sampler, options, photons, stored, rejected, room
         if options.remember:
             dr.scatter(photons.path, path, slot, active)
 
-    _trace_wavefront(scene, source, sampler, options, store, reject)
+    _trace_wavefront(scene, source, sampler, share, options, store, reject)
     return photons, stored, rejected
 
 
 @dr.syntax
-def _trace_wavefront(scene, source, sampler, options, store, reject):
+def _trace_wavefront(scene, source, sampler, share, options, store, reject):
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
     o = options
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
     reach = dr.opaque(mi.Float, largest_coordinate(scene))
 
-    ray, emitted, path, shortest, finite = _leave_emitter(source, sampler, o)
+    ray, emitted, path, shortest, finite = _leave_emitter(source, sampler, share, o)
     reject(~finite)
     ray = mi.Ray3f(ray)  # Current ray
     β = mi.Spectrum(1)  # Path throughput, shading-normal corrections included
@@ -268,7 +271,7 @@ def _trace_wavefront(scene, source, sampler, options, store, reject):
         depth += 1
 
 
-def _leave_emitter(source, sampler, o):
+def _leave_emitter(source, sampler, share, o):
     """(ray, flux, number of the path, segments of the shortest path that is stored, is the flux
     finite?) of every path."""
     numbers = _first_numbers(sampler)
@@ -276,7 +279,6 @@ def _leave_emitter(source, sampler, o):
     worth = mi.Float(1)
     if o.aim is not None:
         # Stratified: path k of n chooses between k/n and (k + 1)/n.
-        share = dr.rcp(dr.opaque(mi.Float, dr.width(path)))
         *numbers, worth = o.aim((mi.Float(path) + sampler.next_1d()) * share, *numbers)
     ray, emitted, emitter = source.sample_ray(mi.Float(0), *numbers, wavelengths=o.wavelengths)
     emitted *= worth

@@ -267,14 +267,17 @@ def _power_heuristic(a, b):
 
 @dr.syntax
 def _skip_emitters(scene, ray, si, active):
-    """The first surface behind directly visible area lights (``hide_emitters``), and the ray that
-    finds it."""
+    """The first surface behind directly visible area lights (``hide_emitters``), as far away as it
+    is from where the ray began, and the ray that finds it."""
     ray = mi.Ray3f(ray)
+    passed = mi.Float(0)
     active = active & si.is_valid()
     active &= si.emitter(scene) != None  # noqa: E711
     while active:
+        passed[active] += si.t
         ray[active] = si.spawn_ray(ray.d)
         si[active] = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         active &= si.emitter(scene) != None  # noqa: E711
+    si.t += passed
     return si, ray

@@ -85,7 +85,7 @@ def explain(
         border = (width.shape[1] - sensor.film().crop_size().x) // 2
         row, column = (pixel[k] - sensor.film().crop_offset()[k] + border for k in (1, 0))
         seen = footprint.of(sensor, radius0, float(width[row, column]))
-        prepared = replace(prepared, footprint=seen.in_pass(pass_index))
+        prepared = replace(prepared, footprint=seen and seen.in_pass(pass_index))
     radius = bandwidth(radius0, settings.alpha, pass_index)
     colour = wavelength_sample(seed, pass_index)
     wavelengths = film.wavelengths(sensor, colour) if mi.is_spectral else None
@@ -97,7 +97,7 @@ def explain(
     position = mi.Point2f(*pixel) + sampler.next_2d()
     ray, ray_weight = film.rays_through(sensor, sampler, position, colour)
     vertices = _Vertices.empty(samples)
-    _, _, points = prepared.trace(sampler, ray, see=vertices.see)
+    _, _, points = prepared.trace(sampler, ray, watch=lambda: vertices.see)
 
     found = Explanation(
         pixel=(int(pixel[0]), int(pixel[1])),
