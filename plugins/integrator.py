@@ -264,6 +264,7 @@ class AnisoPhotonMapper:
         self.checkpoint: Checkpoint | None = None
         self.elsewhere: Callable[[progressive.Run], Iterator[Batch]] | None = None
         self.first_pass = 0
+        self._last_map: tuple | None = None
         self._exposed: dict[str, Any] = {}
 
     # --- Mitsuba's interface ---
@@ -287,7 +288,7 @@ class AnisoPhotonMapper:
         total, and without a limit to their number that of each."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[int(sensor)]
-        self.statistics, self.variance, self.layers = {}, None, {}
+        self.statistics, self.variance, self._last_map, self.layers = {}, None, None, {}
         with dr.suspend_grad():
             prepared = prepare(scene, self.settings, self.hide_emitters)
             so_far = partial(self._so_far, film_weights(sensor.film()))
@@ -303,6 +304,8 @@ class AnisoPhotonMapper:
                 prepared, sensor, _as_int(seed), spp, controls, self.statistics
             )
             so_far(done.variance, done.layers, done.passes)
+            if done.map:
+                self._last_map = (scene, done.scene, done.map, done.radius)
             image = sensor.film().develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)
@@ -312,21 +315,24 @@ class AnisoPhotonMapper:
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """Radiance along rays; see ``mi.SamplingIntegrator.sample``.
 
-        For integrators that contain this one and call sample() alone, as ``moment`` does (``aov``
-        calls render()). Each call traces photons of its own: the scene may have changed since the
-        last one.
+        For integrators that contain this one. ``aov`` calls render() and then sample(), which
+        uses the map that render() has left; ``moment`` calls sample() alone, and each call traces
+        photons of its own, since the scene may have changed since the last one.
         """
+        left, self._last_map = self._last_map, None
         if mi.is_spectral:
             raise Unsupported(
                 "aniso_pm: in spectral variants this integrator cannot be sampled by another "
                 "one that draws wavelengths of its own; render with it directly"
             )
-        prepared = prepare(scene, self.settings, self.hide_emitters)
-        seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
-        if self.settings.photon_count == 0:
-            prepared = prepared.with_(photon_count=USUAL)
-        radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
-        map_ = prepared.photon_map(seed, 0)
+        if left is None or left[0] is not scene:
+            prepared = prepare(scene, self.settings, self.hide_emitters)
+            seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
+            if self.settings.photon_count == 0:
+                prepared = prepared.with_(photon_count=USUAL)
+            radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
+            left = (scene, prepared, prepared.photon_map(seed, 0), radius)
+        _, prepared, map_, radius = left
         seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
         seen = prepared.radiance(sampler, ray, map_, dr.opaque(mi.Float, radius), seed)
         return dr.select(active, seen.L, 0), seen.valid & active, []

@@ -219,3 +219,13 @@ def test_scores_are_squares_of_what_photons_give(variant_llvm_rgb):
     assert np.sqrt(score / 9).sum() == pytest.approx(float(np.array(L).mean()), rel=1e-4)
     assert map_.origins.numbers.shape == (20_000, 5)
     assert int(np.array(map_.origins.path).max()) < 20_000
+
+
+def test_a_shorter_last_wavefront_is_aimed_as_the_others_are(variant_llvm_rgb):
+    """Light paths that are replayed in three wavefronts, of 4000, 4000 and 2000."""
+    _, prepared, settled = found_in("area")
+    scene = replace(prepared.with_(photon_count=10_000), chosen="global", aim=settled.aim.aim())
+    whole = scene.photon_map(3, 0).stored
+    parts = replace(scene.frozen(), light_wavefront=4000)
+    for index in range(3):
+        assert parts.photon_map(3, index).stored == pytest.approx(whole, rel=0.03)

@@ -227,3 +227,22 @@ def test_films_without_room_for_layers_are_refused(variant_llvm_spectral):
     plugin = mi.load_dict({"type": "aniso_pm", "layers": "albedo"})
     with pytest.raises(ValueError, match="has no room for layers; take an hdrfilm"):
         plugin.render(mi.load_dict(scene))
+
+
+def test_albedo_in_spectral_variants_is_mitsubas(variant_llvm_spectral):
+    scene = mi.load_dict(room(size=8))
+    # Each pass has four wavelengths.
+    _, found = rendered(scene, spp=256, passes=64, asked="albedo")
+    aov = mi.load_dict({"type": "aov", "aovs": "a:albedo"})
+    wall = np.s_[3:5, 3:5]  # the back one alone
+    theirs = np.array(mi.render(scene, integrator=aov, spp=1024))[wall].mean((0, 1))
+    np.testing.assert_allclose(found["albedo"][wall].mean((0, 1)), theirs, rtol=0.03)
+
+
+def test_depth_behind_a_hidden_lamp_is_counted_from_the_camera(variant_llvm_rgb):
+    scene = room(size=8)
+    plain = rendered(mi.load_dict(scene), asked="depth", passes=1)[1]["depth"]
+    to_world = mi.ScalarTransform4f().translate([0, 0, 0.4]).scale(0.6)
+    scene["lamp"] = {"type": "rectangle", "to_world": to_world, "emitter": {"type": "area"}}
+    hidden = rendered(mi.load_dict(scene), asked="depth", passes=1, hide_emitters=True)[1]["depth"]
+    np.testing.assert_allclose(hidden, plain, rtol=0.05)

@@ -119,3 +119,22 @@ def test_hidden_sky_stays_hidden_behind_null_surfaces_as_in_path(rgb, front):
     path = mi.load_dict({"type": "path", "hide_emitters": True})
     path = array(mi.render(scene, integrator=path, spp=256))
     np.testing.assert_allclose(ours.mean((0, 1)), path.mean((0, 1)), rtol=0.05, atol=0.005)
+
+
+def test_an_irradiance_meter_is_a_sensor_like_others(rgb):
+    """It knows ray differentials only."""
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    definition = room(size=4)
+    del definition["sensor"]
+    definition["meter"] = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f()
+        .translate([0, -0.4, 0])
+        .rotate([1, 0, 0], -90)
+        .scale(0.3),
+        "sensor": {"type": "irradiancemeter", "film": film},
+    }
+    scene = mi.load_dict(definition)
+    ours = array(mi.render(scene, integrator=integrator(), spp=16_384)).mean()
+    path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=16_384)).mean()
+    assert ours == pytest.approx(path, rel=0.1)

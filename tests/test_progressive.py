@@ -232,6 +232,17 @@ def test_compilation_does_not_count_as_rendering(monkeypatch):
     assert rules.spent() == pytest.approx(0.05 - 100, abs=0.1)
 
 
+def test_compilation_before_the_first_pass_does_not_shorten_it(monkeypatch):
+    rules = Stopping(Settings(passes=0, time=1.0))
+    kernels = [{"codegen_time": 0.0, "backend_time": 1e5}]
+    monkeypatch.setattr(dr, "kernel_history", lambda: [kernels.pop()] if kernels else [])
+    rules.count_compilation()
+    with rules.measured():
+        time.sleep(0.05)
+    assert rules._expected_duration() == pytest.approx(0.05, abs=0.04)
+    assert rules.compiling == pytest.approx(100)
+
+
 def test_the_number_of_passes_still_ends_a_long_budget():
     plugin = integrator(time=1000.0, passes=3)
     render(load(), plugin, 6)
@@ -446,3 +457,8 @@ def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
 def test_every_scene_of_the_matrix_is_replayed_right():
     replayed = {(n, use): assert_replayed_right(n, use) for n in matrix.rows() for use in USES}
     assert sum(replayed.values()) > 0.9 * len(replayed)
+
+
+def test_sample_numbers_that_a_pixel_does_not_have_are_refused():
+    with pytest.raises(ValueError, match="beyond sample 536870912 of a pixel"):
+        schedule.shares(Settings(passes=1), 1024, 64, first_pass=5_000_000)

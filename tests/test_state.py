@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from aniso_pm.rendering.digest import differences, scene_entries
 from aniso_pm.rendering.state import Checkpoint, State, StateError, describe, merge
 from conftest import leave_out_the_pilot
 from passes import close, integrator, load, render
@@ -293,3 +294,26 @@ def test_checkpoints_of_films_with_alpha_crop_and_other_colours(tmp_path):
     assert image.shape == (8, 5, 2)
     close(np.array(film.develop()), image)
     assert state.variance().shape == (8, 5, 4)
+
+
+def test_lights_without_shape_and_instanced_shapes_are_part_of_the_scene():
+    def entries(intensity=1.0, reflectance=0.5, radius=0.3):
+        ball = {"type": "sphere", "radius": radius, "bsdf": {"type": "diffuse"}}
+        ball["bsdf"]["reflectance"] = {"type": "rgb", "value": reflectance}
+        parts = {
+            "group": {"type": "shapegroup", "ball": ball},
+            "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+            "lamp": {"type": "point", "position": [0, 0.5, 0.5], "intensity": intensity},
+        }
+        return scene_entries(mi.load_dict(room_with_plate(8) | parts))
+
+    assert differences(entries(), entries()) == []
+    assert differences(entries(), entries(intensity=2.0)) == ["scene, lamp has changed"]
+    for change in ({"reflectance": 0.4}, {"radius": 0.2}):
+        assert differences(entries(), entries(**change)) == ["scene, ball has changed"]
+
+
+def test_a_checkpoint_takes_its_path_as_text(tmp_path):
+    path = str(tmp_path / "a.state")
+    render(load(8), integrator(passes=2), 4, checkpoint=Checkpoint(path))
+    assert State.load(path).passes == [[0, 2]]

@@ -1,14 +1,18 @@
 """What the survey finds, against what renderings of known noise show."""
 
+import warnings
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm.instruments import gallery
-from aniso_pm.rendering import pilot, plan
+from aniso_pm.rendering import pilot, plan, survey
 from aniso_pm.rendering.film import border
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
-from aniso_pm.rendering.tiles import SAMPLES, Tiles
+from aniso_pm.rendering.tiles import COARSE, SAMPLES, Tiles
+from aniso_pm.transport import eye
 from rooms import room, room_with_ball, room_with_plate
 
 
@@ -121,3 +125,28 @@ def test_variances_are_those_of_the_samples(variant_llvm_rgb):
     v_shared, v_alone = plan.of_photons(a - b, weight)
     assert v_shared.mean() == pytest.approx(0.2, rel=0.03)
     assert v_alone.mean() == pytest.approx(0.5, rel=0.03)
+
+
+def test_work_is_counted_once_where_gather_points_need_more_room(variant_llvm_rgb, monkeypatch):
+    world = mi.load_dict(room_with_ball(size=16))
+    scene = replace(prepare(world, Settings(), False), chosen="survey")
+    sensor = world.sensors()[0]
+    tiles = Tiles.of(sensor, COARSE)
+    work = survey._trace(scene, sensor, tiles, 0).work
+    asked = []
+
+    def too_little_at_first(capacity):
+        asked.append(capacity)
+        return 100 if len(asked) == 1 else capacity
+
+    monkeypatch.setattr(eye, "_rounded_up", too_little_at_first)
+    again = survey._trace(scene, sensor, tiles, 0)
+    assert len(asked) == 2
+    np.testing.assert_array_equal(again.work, work)
+
+
+def test_a_film_of_one_pixel_has_nothing_to_tell_apart(variant_llvm_rgb):
+    tiles = Tiles(1, 1, 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert tiles.counts(np.ones(1), np.ones(1), 16) is None

@@ -66,19 +66,23 @@ class Settings:
             )
         self._between("gather_roughness", 0.01, 1e30)
         self._between("photon_count", 0, 2 * 10**8, "between 1 and 2e+08, or 0 (automatic)")
-        self._between("time", 0, 1e9, "0 (no limit) or up to 1e+09 seconds")
-        self._between("target_error", 0, 1e3, "0 (no target) or a relative error of up to 1000")
+        self._between("time", 0, 1e9, "0 (no limit) or a positive number of up to 1e+09 seconds")
+        self._between(
+            "target_error", 0, 1e3, "0 (no target) or a positive relative error of up to 1000"
+        )
         endless = self.passes == 0 and not self.open_ended
         words = 'between 1 and 1e+07, or 0 (no limit) where "time" or "target_error" is given'
         self._between("passes", 0, 10**7, words, not endless)
         self._between("alpha", 0, 1, "above 0 and at most 1", self.alpha > 0)
-        self._between("initial_radius", 0, 1e30, "0 (automatic) or a length of up to 1e+30")
+        self._between(
+            "initial_radius", 0, 1e30, "0 (automatic) or a positive length of up to 1e+30"
+        )
         self._between("gather_tolerance", 0, 1)
         self._between(
             "max_depth", -1, 10**6, "-1 (unlimited) or between 1 and 1e+06", self.max_depth != 0
         )
         self._between("rr_depth", 1, 10**6)
-        self._between("max_memory", 0, 1e6, "0 (automatic) or up to 1e+06 GiB")
+        self._between("max_memory", 0, 1e6, "0 (automatic) or a positive number of up to 1e+06 GiB")
         if "standard_error" in self.layer_names and self.passes == 1:
             raise ValueError(
                 'aniso_pm: parameter "layers" asks for "standard_error", which is the spread of '
