@@ -5,6 +5,10 @@ bounce, wherever it lands: paths of j segments deposit Φ ρ^(j−1), so that al
 together carry Φ (ρ + ρ² + …), whatever the shape of the room.
 """
 
+import subprocess
+import sys
+from pathlib import Path
+
 import aniso_pm  # noqa: F401
 import drjit as dr
 import mitsuba as mi
@@ -205,3 +209,29 @@ def test_faces_is_the_cosine_of_the_decoded_normal():
     cosine = np.sum(np.array(photon_word.decode_normal(word)) * np.array(b), axis=0)
     clear = np.abs(cosine - 0.75) > 1e-5
     np.testing.assert_array_equal(photon_word.faces(word, b).numpy()[clear], (cosine > 0.75)[clear])
+
+
+_CURVES = """
+import sys
+import aniso_pm
+import drjit as dr
+import mitsuba as mi
+
+mi.set_variant("llvm_ad_rgb")
+dr.set_thread_count(1)
+from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.settings import Settings
+sys.path.insert(0, sys.argv[1])
+import matrix
+
+scene = matrix.make(matrix.rows()["curve"])
+prepared = prepare(scene, Settings(map="global", photon_count=200_000), False)
+for index in range(6):
+    prepared.photon_map(7, index)
+"""
+
+
+def test_paths_that_leave_curves_end_no_process():
+    """Rays from a few ulps off a curve did, now and then, and always with one thread."""
+    command = [sys.executable, "-c", _CURVES, str(Path(__file__).parent)]
+    assert subprocess.run(command, timeout=300).returncode == 0

@@ -39,7 +39,7 @@ from ..map.spectra import channel_mean
 from .aim import Aim
 from .bent import bent_bounce, viewed
 from .emission import Emission, only_photons_see
-from .rays import largest_coordinate, spawn_ray
+from .rays import reach_of, spawn_ray
 
 # Light paths traced at once: bounds the memory of a wavefront, not the number of photons.
 WAVEFRONT = 1 << 21
@@ -189,7 +189,7 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
     o = options
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
-    reach = dr.opaque(mi.Float, largest_coordinate(scene))
+    reach = dr.opaque(mi.Float, reach_of(scene))
 
     ray, emitted, path, shortest, finite = _leave_emitter(source, sampler, share, o)
     reject(~finite)

@@ -20,10 +20,16 @@ _ULPS = 64
 MITSUBA_OFFSET = 1500 * _ULP
 
 
-def largest_coordinate(scene) -> float:
-    """Largest |coordinate| of the scene's bounding box, world units; infinite without shapes."""
+def reach_of(scene) -> float:
+    """Largest |coordinate| of the scene's bounding box, world units: ``spawn_ray`` asks for it.
+
+    Infinite without shapes, and where there are curves, so that rays leave surfaces as far off as
+    Mitsuba's do: those that begin closer to a curve make its intersection routine (Mitsuba 3.9.1
+    with Embree) return what ends the process.
+    """
     box = scene.bbox()
-    if not box.valid():
+    curves = int(mi.ShapeType.BSplineCurve) | int(mi.ShapeType.LinearCurve)
+    if not box.valid() or scene.shape_types() & curves:
         return float("inf")
     return max(*map(abs, box.min), *map(abs, box.max))
 
@@ -32,7 +38,7 @@ def spawn_ray(si, d, reach):
     """The ray from the surface interaction ``si`` in the direction d (world), started 64 ulps of
     |p| + reach off the surface, and never further off than Mitsuba would.
 
-    reach: ``largest_coordinate`` of the scene, as a Dr.Jit array.
+    reach: ``reach_of`` of the scene, as a Dr.Jit array.
     """
     size = dr.max(dr.abs(si.p))
     offset = dr.minimum(MITSUBA_OFFSET * (1 + size), _ULPS * _ULP * (size + reach))

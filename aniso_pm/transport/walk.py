@@ -17,7 +17,7 @@ from ..lobe_path import GlossyVertex, follow, no_lobe
 from ..map.receivers import gathered_part, read_receiver
 from ..map.spectra import channel_mean
 from . import layers
-from .rays import largest_coordinate, spawn_ray
+from .rays import reach_of, spawn_ray
 from .survey_parts import Apart
 from .thinning import Thinning
 from .uses import Use
@@ -99,7 +99,7 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
     ctx = mi.BSDFContext()
     o = options
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
-    reach = dr.opaque(mi.Float, largest_coordinate(scene))
+    reach = dr.opaque(mi.Float, reach_of(scene))
 
     ray = mi.Ray3f(ray)  # Current ray
     lane = dr.arange(mi.UInt32, dr.width(ray))
