@@ -157,4 +157,6 @@ def test_the_whole_benchmark_runs_quickly(capsys):
     assert cli.main(["bench", "--quick", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert {row["name"].split(":")[0] for row in rows} == set(GROUPS)
-    assert all(row["figure"] is not None for row in rows)
+    # Large pictures are too slow for that, and say so.
+    quick = [row for row in rows if not row["name"].startswith("large")]
+    assert all(row["figure"] is not None for row in quick), quick

@@ -99,6 +99,15 @@ def test_a_crop_window_shows_the_same_pixels(variant_llvm_rgb):
     np.testing.assert_allclose(shares(cropped, [1, 10]), shares(whole, [1, 10]), rtol=1e-3)
 
 
+def test_cameras_side_by_side_have_pixels_as_wide_as_one_alone(variant_llvm_rgb):
+    to_world = mi.ScalarTransform4f().translate([5, 0, 0])
+    two = {"a": {"type": "perspective"}, "b": {"type": "perspective", "to_world": to_world}}
+    film = {"type": "hdrfilm", "width": 200, "height": 80}
+    both = late(footprint.of(camera("batch", film=film, **two), 10.0))
+    one = late(footprint.of(camera(), 10.0))
+    np.testing.assert_allclose(shares(both, [10]), shares(one, [10]), rtol=0.3)
+
+
 def test_sensors_whose_pixels_have_no_width_have_one_radius(variant_llvm_rgb):
     """The kernels of a radiance meter's passes are as wide as their radius says."""
     film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}

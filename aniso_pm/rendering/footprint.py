@@ -77,15 +77,17 @@ def of(sensor, radius: float, widths=1.0) -> Footprint | None:
     centre, aperture = mi.Point2f(0.5), mi.Point2f(0.5)
     time = mi.Float(sensor.shutter_open())
     size = sensor.film().crop_size()  # what positions are relative to
-    # Neighbours along both axes: the wider one counts.
+    # Neighbours along both axes: the wider one counts. To one side: a ``batch`` of sensors may meet
+    # in the middle. No farther than to the border, in films of one pixel.
+    ray, _ = sample_ray(sensor, time, mi.Float(0.5), centre, aperture)
     start = spread = mi.Float(0)
-    for half in (mi.Vector2f(0.5 / size[0], 0), mi.Vector2f(0, 0.5 / size[1])):
-        ray, beside = (
-            sample_ray(sensor, time, mi.Float(0.5), centre + side, aperture)[0]
-            for side in (-half, half)
-        )
-        start = dr.maximum(start, dr.norm(beside.o - ray.o))
-        spread = dr.maximum(spread, dr.norm(beside.d - ray.d))
+    for axis in (0, 1):
+        step = min(1 / size[axis], 0.5)
+        to = mi.Point2f(0.5 + step, 0.5) if axis == 0 else mi.Point2f(0.5, 0.5 + step)
+        beside, _ = sample_ray(sensor, time, mi.Float(0.5), to, aperture)
+        pixel = 1 / size[axis] / step
+        start = dr.maximum(start, pixel * dr.norm(beside.o - ray.o))
+        spread = dr.maximum(spread, pixel * dr.norm(beside.d - ray.d))
     if float(start[0]) == 0 and float(spread[0]) == 0:
         return None
     unit = dr.rcp(dr.opaque(mi.Float, radius))
