@@ -79,8 +79,10 @@ def test_indirect_light_agrees_with_path_within_one_percent(room, kernel):
 @pytest.mark.parametrize("depth", [1, 2, 3, 4, 5, 6])
 @pytest.mark.parametrize("room", ROOMS)
 def test_every_max_depth_agrees_within_one_percent(room, depth):
-    spp = 16384 if room == "ball" else 256
-    assert_agrees(room, "lobe", depth, 400_000, 8, spp, range(6), 0.01)
+    spp, passes = 256, 8
+    if room == "ball":  # few bright eye paths at depth 2, from there on few bright photons
+        spp, passes = (16_384, 8) if depth <= 2 else (4096, 48)
+    assert_agrees(room, "lobe", depth, 400_000, passes, spp, range(6), 0.01)
 
 
 # --- Other materials: receivers or not, every light path is counted exactly once ---
