@@ -320,14 +320,14 @@ class AnisoPhotonMapper:
         photons of its own, since the scene may have changed since the last one.
         """
         left, self._last_map = self._last_map, None
-        if mi.is_spectral:
-            raise Unsupported(
-                "aniso_pm: in spectral variants this integrator cannot be sampled by another "
-                "one that draws wavelengths of its own; render with it directly"
-            )
         if left is None or left[0] is not scene:
             prepared = prepare(scene, self.settings, self.hide_emitters)
             seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
+            if mi.is_spectral:
+                raise Unsupported(
+                    "aniso_pm: in spectral variants this integrator cannot be sampled by another "
+                    "one that draws wavelengths of its own; render with it directly"
+                )
             if self.settings.photon_count == 0:
                 prepared = prepared.with_(photon_count=USUAL)
             radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)

@@ -140,6 +140,14 @@ def test_inside_aov_it_renders_the_same_picture(scene):
     np.testing.assert_allclose(image[..., :3].mean(), plain.mean(), rtol=0.05)
 
 
+def test_inside_aov_it_renders_the_same_picture_in_spectral_variants(variant_llvm_spectral):
+    scene = mi.load_dict(room(size=8))
+    plain = array(mi.render(scene, integrator=integrator(), spp=16))
+    outer = mi.load_dict({"type": "aov", "aovs": "d:depth", "image": SMALL})
+    image = array(mi.render(scene, integrator=outer, spp=16))
+    np.testing.assert_allclose(image[..., :3], plain, rtol=1e-3, atol=1e-4)
+
+
 def test_aov_uses_the_map_that_render_left(scene, monkeypatch):
     from aniso_pm.transport import photons
 

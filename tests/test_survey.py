@@ -132,17 +132,12 @@ def test_work_is_counted_once_where_gather_points_need_more_room(variant_llvm_rg
     scene = replace(prepare(world, Settings(), False), chosen="survey")
     sensor = world.sensors()[0]
     tiles = Tiles.of(sensor, COARSE)
-    work = survey._trace(scene, sensor, tiles, 0).work
-    asked = []
-
-    def too_little_at_first(capacity):
-        asked.append(capacity)
-        return 100 if len(asked) == 1 else capacity
-
-    monkeypatch.setattr(eye, "_rounded_up", too_little_at_first)
-    again = survey._trace(scene, sensor, tiles, 0)
-    assert len(asked) == 2
-    np.testing.assert_array_equal(again.work, work)
+    works = []
+    for rooms in ([100_000], [100, 100_000]):  # enough at once; too little at first
+        monkeypatch.setattr(eye, "_rounded_up", lambda _, rooms=rooms: rooms.pop(0))
+        works.append(survey._trace(scene, sensor, tiles, 0).work)
+        assert not rooms
+    np.testing.assert_array_equal(*works)
 
 
 def test_a_film_of_one_pixel_has_nothing_to_tell_apart(variant_llvm_rgb):
