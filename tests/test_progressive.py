@@ -1,22 +1,18 @@
-"""Passes: pure, summed with their variance, stopped by time or error, replayed."""
+"""Passes: pure, summed with their variance, as many as one likes."""
 
 import math
 import time
 from pathlib import Path
 
 import aniso_pm  # noqa: F401
-import drjit as dr
-import matrix
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.rendering import one_pass, progress, schedule
+from aniso_pm.rendering import progress, schedule
 from aniso_pm.rendering.accumulate import Sums, mean_and_variance, relative_standard_error
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.state import Checkpoint, State
-from aniso_pm.rendering.stopping import Stopping
-from conftest import slow
-from passes import SMALL, close, integrator, load, render
+from passes import close, integrator, load, render
 from rooms import room, room_with_ball
 
 pytestmark = pytest.mark.usefixtures("without_pilot")
@@ -80,6 +76,11 @@ def test_passes_differ_from_each_other_and_between_seeds():
 def test_samples_are_shared_evenly_and_open_ends_take_short_passes(parameters, spp, pixels, each):
     shares = schedule.shares(Settings(**parameters), spp, pixels)
     assert [shares(i) for i in range(len(each))] == each
+
+
+def test_sample_numbers_that_a_pixel_does_not_have_are_refused():
+    with pytest.raises(ValueError, match="beyond sample 536870912 of a pixel"):
+        schedule.shares(Settings(passes=1), 1024, 64, first_pass=5_000_000)
 
 
 @pytest.mark.with_pilot
@@ -207,77 +208,6 @@ def test_relative_error_is_scale_free_and_not_hidden_by_a_lamp():
     assert relative_standard_error(0 * mean, variance) == 0
 
 
-# --- Stopping ---
-
-
-def test_time_ends_rendering(monkeypatch, ticking):
-    monkeypatch.setattr(dr, "kernel_history", list)  # what is compiled here takes no time
-    plugin = integrator(time=1.0)
-    assert plugin.parameters()["passes"] == 0
-    scene = load(16)
-    began = time.perf_counter()
-    image = render(scene, plugin, 16)
-    assert plugin.statistics["passes"] >= 2 and np.isfinite(image).all()
-    assert time.perf_counter() - began == pytest.approx(1, abs=0.1)
-
-
-def test_compilation_does_not_count_as_rendering(monkeypatch):
-    """Kernels that take 100 s to compile leave a 1 s budget untouched."""
-    rules = Stopping(Settings(passes=0, time=1.0))
-    with rules.measured():
-        time.sleep(0.05)
-        kernel = {"codegen_time": 40.0, "backend_time": 1e5 - 40}
-        monkeypatch.setattr(dr, "kernel_history", lambda: [kernel])
-    assert not dr.flag(dr.JitFlag.KernelHistory)
-    assert rules.spent() == pytest.approx(0.05 - 100, abs=0.1)
-
-
-def test_compilation_before_the_first_pass_does_not_shorten_it(monkeypatch):
-    rules = Stopping(Settings(passes=0, time=1.0))
-    kernels = [{"codegen_time": 0.0, "backend_time": 1e5}]
-    monkeypatch.setattr(dr, "kernel_history", lambda: [kernels.pop()] if kernels else [])
-    rules.count_compilation()
-    with rules.measured():
-        time.sleep(0.05)
-    assert rules._expected_duration() == pytest.approx(0.05, abs=0.04)
-    assert rules.compiling == pytest.approx(100)
-
-
-def test_the_number_of_passes_still_ends_a_long_budget():
-    plugin = integrator(time=1000.0, passes=3)
-    render(load(), plugin, 6)
-    assert plugin.statistics["passes"] == 3 and plugin.statistics["spp"] == 6
-
-
-def test_target_error_ends_rendering_where_it_says():
-    scene = load()
-    plugin = integrator(target_error=0.1)
-    render(scene, plugin, 4)
-    count = plugin.statistics["passes"]
-    assert plugin.statistics["relative_error"] <= 0.1 and count > 4
-    fewer = integrator(passes=int(count * 0.9))
-    render(scene, fewer, 4 * fewer.settings.passes)
-    assert fewer.statistics["relative_error"] > 0.1
-
-
-def test_nothing_to_see_reaches_any_target():
-    definition = room(size=4)
-    del definition["light"]["emitter"]
-    plugin = integrator(target_error=0.5)
-    plugin.render(mi.load_dict(definition), spp=2)
-    assert plugin.statistics["passes"] == 4
-
-
-def test_passes_without_any_end_are_refused():
-    with pytest.raises(Exception, match='"passes" is 0.*"time" or "target_error"'):
-        mi.load_dict(SMALL | {"passes": 0})
-    plugin = integrator(passes=3)
-    plugin.stop_after(time=2.0)
-    assert plugin.parameters()["passes"] == 0 and plugin.parameters()["time"] == 2
-    with pytest.raises(ValueError, match="passes"):
-        plugin.stop_after()
-
-
 # --- What programs see ---
 
 
@@ -384,81 +314,3 @@ def test_automatic_radius_suits_a_coin_and_a_stadium(scale):
     even = math.sqrt(24 * 60 / s["photons_stored"] / (4 * math.pi))
     assert 0.5 * even < s["initial_radius"] / scale < even
     assert 30 < s["photons_gathered"] / s["gather_points"] < 120
-
-
-@pytest.mark.slow
-def test_a_ten_second_budget_ends_within_a_second_of_ten():
-    path = Path(__file__).parents[1] / "scenes" / "teapot.xml"
-    scene = mi.load_file(str(path), width="320", height="240")
-    plugin = scene.integrator()
-    plugin.stop_after(passes=1)
-    plugin.render(scene, spp=1)  # compile
-    plugin.stop_after(time=10.0)
-    began = time.perf_counter()
-    plugin.render(scene)
-    took = time.perf_counter() - began
-    print(f"{took:.2f} s, {plugin.statistics['passes']} passes")
-    assert 9 < took < 11
-
-
-# --- Replayed paths ---
-
-USES = {"global": {}, "caustic": {"map": "caustic"}, "final gather": {"final_gather": True}}
-
-
-def passes_by_themselves(scene, parameters, count):
-    """The picture of ``count`` passes of one sample, each traced in Python for itself."""
-    film = scene.sensors()[0].film()
-    total = 0.0
-    for i in range(count):
-        render(scene, integrator(**parameters), 1, first_pass=i)
-        total = total + np.array(film.develop(raw=True), dtype=np.float64)
-    return total[..., :-1] / total[..., -1:]
-
-
-def assert_replayed_right(name, use):
-    """Nothing of the first pass is frozen that belongs to that pass alone."""
-    scene = matrix.make(matrix.rows()[name], 8)
-    plugin = integrator(passes=4, **USES[use])
-    together = render(scene, plugin, 4)
-    alone = passes_by_themselves(scene, USES[use], 4)
-    # A path that rounding sends another way changes its pixel; there are few.
-    different = np.abs(together - alone) > 2e-3 * np.abs(alone) + 2e-4
-    print(f"{name}, {use}: {different.mean():.3f} differ, {plugin.statistics['replayed']=}")
-    assert different.mean() < 0.03
-    return plugin.statistics["replayed"]
-
-
-@pytest.mark.parametrize("use", ["caustic", *slow(*(use for use in USES if use != "caustic"))])
-def test_replayed_passes_are_those_that_python_traces(use):
-    assert assert_replayed_right("roughplastic floor under glass", use)
-
-
-@pytest.mark.with_pilot
-def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
-    """An error while Dr.Jit records costs time, not the picture; any other error is raised."""
-
-    def fail(*arguments):
-        raise RuntimeError("cannot be recorded")
-
-    monkeypatch.setattr(dr, "freeze", lambda function: fail)
-    scene = load()
-    plugin = integrator(passes=3)
-    image = render(scene, plugin, 6)
-    assert plugin.statistics["replayed"] is False and plugin.statistics["passes"] == 3
-    monkeypatch.undo()
-    close(image, render(scene, integrator(passes=3), 6))
-    monkeypatch.setattr(one_pass.films, "splat", fail)
-    with pytest.raises(RuntimeError, match="cannot be recorded"):
-        render(scene, integrator(passes=3), 6)
-
-
-@pytest.mark.slow
-def test_every_scene_of_the_matrix_is_replayed_right():
-    replayed = {(n, use): assert_replayed_right(n, use) for n in matrix.rows() for use in USES}
-    assert sum(replayed.values()) > 0.9 * len(replayed)
-
-
-def test_sample_numbers_that_a_pixel_does_not_have_are_refused():
-    with pytest.raises(ValueError, match="beyond sample 536870912 of a pixel"):
-        schedule.shares(Settings(passes=1), 1024, 64, first_pass=5_000_000)

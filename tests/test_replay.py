@@ -1,0 +1,73 @@
+"""Paths that are traced in Python once and then replayed are those that it would trace."""
+
+import aniso_pm  # noqa: F401
+import drjit as dr
+import matrix
+import numpy as np
+import pytest
+from aniso_pm.rendering import one_pass
+from conftest import slow
+from passes import close, integrator, load, render
+
+pytestmark = pytest.mark.usefixtures("without_pilot")
+
+
+@pytest.fixture(autouse=True)
+def _variant(variant_llvm_rgb):
+    pass
+
+
+USES = {"global": {}, "caustic": {"map": "caustic"}, "final gather": {"final_gather": True}}
+
+
+def passes_by_themselves(scene, parameters, count):
+    """The picture of ``count`` passes of one sample, each traced in Python for itself."""
+    film = scene.sensors()[0].film()
+    total = 0.0
+    for i in range(count):
+        render(scene, integrator(**parameters), 1, first_pass=i)
+        total = total + np.array(film.develop(raw=True), dtype=np.float64)
+    return total[..., :-1] / total[..., -1:]
+
+
+def assert_replayed_right(name, use):
+    """Nothing of the first pass is frozen that belongs to that pass alone."""
+    scene = matrix.make(matrix.rows()[name], 8)
+    plugin = integrator(passes=4, **USES[use])
+    together = render(scene, plugin, 4)
+    alone = passes_by_themselves(scene, USES[use], 4)
+    # A path that rounding sends another way changes its pixel; there are few.
+    different = np.abs(together - alone) > 2e-3 * np.abs(alone) + 2e-4
+    print(f"{name}, {use}: {different.mean():.3f} differ, {plugin.statistics['replayed']=}")
+    assert different.mean() < 0.03
+    return plugin.statistics["replayed"]
+
+
+@pytest.mark.parametrize("use", ["caustic", *slow(*(use for use in USES if use != "caustic"))])
+def test_replayed_passes_are_those_that_python_traces(use):
+    assert assert_replayed_right("roughplastic floor under glass", use)
+
+
+@pytest.mark.with_pilot
+def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
+    """An error while Dr.Jit records costs time, not the picture; any other error is raised."""
+
+    def fail(*arguments):
+        raise RuntimeError("cannot be recorded")
+
+    monkeypatch.setattr(dr, "freeze", lambda function: fail)
+    scene = load()
+    plugin = integrator(passes=3)
+    image = render(scene, plugin, 6)
+    assert plugin.statistics["replayed"] is False and plugin.statistics["passes"] == 3
+    monkeypatch.undo()
+    close(image, render(scene, integrator(passes=3), 6))
+    monkeypatch.setattr(one_pass.films, "splat", fail)
+    with pytest.raises(RuntimeError, match="cannot be recorded"):
+        render(scene, integrator(passes=3), 6)
+
+
+@pytest.mark.slow
+def test_every_scene_of_the_matrix_is_replayed_right():
+    replayed = {(n, use): assert_replayed_right(n, use) for n in matrix.rows() for use in USES}
+    assert sum(replayed.values()) > 0.9 * len(replayed)
