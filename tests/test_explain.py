@@ -77,6 +77,14 @@ def test_the_path_is_told_vertex_by_vertex():
     assert found.lobe.distance == pytest.approx(np.linalg.norm(step), rel=1e-4)
 
 
+def test_what_lies_in_instances_is_named():
+    scene = plate_seen_straight_on()
+    scene["group"] = {"type": "shapegroup", "plate": scene.pop("plate")}
+    scene["copy"] = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    plate, _ = explained(scene, (2, 1)).path
+    assert plate.shape == "plate in group [RoughConductor]"
+
+
 @pytest.mark.parametrize("map_, tolerance", [("global", 0.0), ("global", 0.9), ("caustic", 0.0)])
 def test_photons_inside_are_those_that_geometry_puts_there(map_, tolerance):
     options = {"map": map_, "gather_tolerance": tolerance, "photon_count": 60_000}

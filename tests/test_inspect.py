@@ -88,6 +88,32 @@ def test_evidence_names_shape_and_nested_bsdfs():
     assert found["anisotropic lobes"].evidence == ["parameter kernel=isotropic"]
 
 
+def instance_of(bsdf):
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective"},
+            "light": {"type": "constant"},
+            "floor": {"type": "rectangle", "id": "floor"},
+            "balls": {"type": "shapegroup", "ball": {"type": "sphere", "bsdf": bsdf}},
+            "one": {"type": "instance", "group": {"type": "ref", "id": "balls"}},
+            "two": {"type": "instance", "group": {"type": "ref", "id": "balls"}},
+        }
+    )
+
+
+def test_what_lies_in_instances_is_inspected_once():
+    needs = prepare(instance_of({"type": "dielectric"}), Settings(), False).needs
+    assert needs.chains == ["ball in balls: SmoothDielectric"]
+    assert needs.receivers == ["floor: SmoothDiffuse"] and not needs.lobes
+
+
+def test_instances_of_diffuse_things_need_no_more_than_these():
+    needs = prepare(instance_of({"type": "diffuse"}), Settings(), False).needs
+    assert len(needs.receivers) == 2
+    assert not (needs.general or needs.chains or needs.lobes or needs.bent)
+
+
 @pytest.mark.parametrize(
     "row, general",
     [

@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from .._version import __version__
+from .needs import instanced
 
 # Relative difference of radii that counts as none: another machine's pilot may round differently.
 _SAME_RADIUS = 0.01
@@ -36,22 +37,15 @@ def scene_entries(scene) -> dict[str, str]:
     normals (see above).
     """
     found: dict[str, list[str]] = {}
+    inside = [shape for _, shape in instanced(scene)]
     outside = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
-    for thing in [*scene.shapes(), *_instanced(scene), *outside]:
+    for thing in [*scene.shapes(), *inside, *outside]:
         name = thing.id()
         if not name or re.fullmatch(r"object_\d+|_unnamed_\d+|_arg_\d+", name):
             name = thing.class_name()
         found.setdefault(f"scene, {name}", []).append(_hash(thing))
     # Their order may depend on addresses in memory.
     return {name: "#" + "".join(sorted(hashes)) for name, hashes in found.items()}
-
-
-def _instanced(scene) -> list[Any]:
-    """Shapes of groups: instances show where they are, not what."""
-    if all(shape.class_name() != "Instance" for shape in scene.shapes()):
-        return []
-    tree = mi.traverse(scene).hierarchy.items()
-    return [node for node, (above, _) in tree if above and "ShapeGroup" in above.class_name()]
 
 
 # What is left of its description, as a camera prints it.

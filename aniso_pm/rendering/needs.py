@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from typing import Any
 
 import mitsuba as mi
 
@@ -59,19 +60,12 @@ def read_scene(scene, gather_roughness: float) -> Needs:
             )
     seen = set()
     names = _sharing(scene)
-    for shape in scene.shapes():
-        name = shape.id() or shape.class_name()
+    for name, shape in surfaces(scene):
         if shape.is_medium_transition():
             raise Unsupported(
                 f'aniso_pm: shape "{name}" bounds a participating medium, which this integrator '
                 'does not support; remove the medium or use the integrator "volpath"'
             )
-        if shape.class_name() == "Instance":
-            # Its shapes cannot be reached from Python: anything may be among them.
-            for need in (needs.lobes, needs.chains, needs.receivers, needs.general, needs.bent):
-                need.append(f"{name}: Instance")
-            _refuse_unlit(needs, f"{name}: Instance")
-            continue
         bsdf = shape.bsdf()
         if bsdf is None:
             continue
@@ -102,13 +96,31 @@ def read_scene(scene, gather_roughness: float) -> Needs:
     return needs
 
 
+def instanced(scene) -> list[tuple[Any, Any]]:
+    """(group, shape) for the shapes of shape groups, which ``scene.shapes()`` leaves out."""
+    if all(shape.class_name() != "Instance" for shape in scene.shapes()):
+        return []
+    tree = mi.traverse(scene).hierarchy.items()
+    return [
+        (above, node) for node, (above, _) in tree if above and "ShapeGroup" in above.class_name()
+    ]
+
+
+def surfaces(scene) -> list[tuple[str, Any]]:
+    """Names of all shapes that have materials, and the shapes; those of groups once."""
+    own = [shape for shape in scene.shapes() if shape.class_name() != "Instance"]
+    named = [(shape.id() or shape.class_name(), shape) for shape in own]
+    for group, shape in instanced(scene):
+        named.append((f"{shape.id() or shape.class_name()} in {group.id()}", shape))
+    return named
+
+
 def _sharing(scene) -> dict[int, list[str]]:
     """Names of the shapes that share a BSDF, by its address."""
     found: dict[int, Counter[str]] = {}
-    for shape in scene.shapes():
-        bsdf = None if shape.class_name() == "Instance" else shape.bsdf()
-        if bsdf is not None:
-            found.setdefault(bsdf.ptr, Counter())[shape.id() or shape.class_name()] += 1
+    for name, shape in surfaces(scene):
+        if (bsdf := shape.bsdf()) is not None:
+            found.setdefault(bsdf.ptr, Counter())[name] += 1
     return {address: _listed(names) for address, names in found.items()}
 
 
@@ -123,8 +135,8 @@ def _refuse_unlit(needs: Needs, evidence: str):
     if needs.unseen:
         raise Unsupported(
             f'aniso_pm: emitter "{needs.unseen[0]}" casts parallel light that the surface '
-            f'"{evidence}" cannot be lit by in this integrator (glossy or transmitting, or maybe '
-            'so); use "directional", "spot" or "area" instead'
+            f'"{evidence}" cannot be lit by in this integrator (glossy or transmitting); use '
+            '"directional", "spot" or "area" instead'
         )
 
 

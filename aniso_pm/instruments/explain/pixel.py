@@ -14,7 +14,7 @@ from ...map import density
 from ...map.gather_points import take
 from ...ndf import read_roughness
 from ...rendering import film, footprint
-from ...rendering.needs import describe
+from ...rendering.needs import describe, surfaces
 from ...rendering.pilot import settle
 from ...rendering.prepared import EYE, PROBE, Prepared, prepare, stream_seed
 from ...rendering.schedule import bandwidth, shares, wavelength_sample
@@ -223,11 +223,11 @@ class _Vertices:
     def path(self, lane: int, scene, gathering) -> list[Vertex]:
         """Vertices of an eye path; gathering: depths at which it reads the photon map."""
         names = {}
-        for shape in scene.shapes():
+        for name, shape in surfaces(scene):
             number = int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
             bsdf = shape.bsdf()
             kind = f" [{describe(bsdf)}]" if bsdf is not None else ""
-            names[number] = (shape.id() or shape.class_name()) + kind
+            names[number] = name + kind
         found = []
         for k in range(lane * _VERTICES, (lane + 1) * _VERTICES):
             if not self.seen[k]:
@@ -237,7 +237,7 @@ class _Vertices:
             found.append(
                 Vertex(
                     depth,
-                    names.get(int(self.shape[k]), "shape in an instance"),
+                    names[int(self.shape[k])],
                     _plain(dr.gather(mi.Vector3f, mi.Vector3f(self.p), k)),
                     _plain(dr.gather(mi.Vector3f, self.n, k)),
                     _scattering(int(self.type[k])),
