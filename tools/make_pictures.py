@@ -1,8 +1,9 @@
-"""Make ``scenes/pictures``: ``python tools/make_pictures.py comparison bars gallery``.
+"""Make ``scenes/pictures``: ``python tools/make_pictures.py comparison bars gallery bandwidth``.
 
 comparison  teapot and pan as the scenes have them, with both kernels, beside their references.
 bars        the same of the brushed wall, with few photons and few eye samples.
 gallery     all references.
+bandwidth   how large the kernels behind each pixel are, beside the picture.
 
 Prints what it measures. Needs matplotlib, which the extra ``dev`` brings.
 """
@@ -41,7 +42,7 @@ def comparison():
         4, 3, figsize=(12, 13.4), height_ratios=[3, 2.25, 3, 2.25], dpi=100, facecolor="white"
     )
     for row, name in enumerate(CLOSE_UPS):
-        scene = mi.load_file(str(SCENES / f"{name}.xml"))
+        scene = mi.load_file(str(SCENES / f"{name}.xml"), optimize=False)
         compared = references.read(SCENES / "references" / f"{name}.exr")
         reference = compared.mean
         columns = []
@@ -78,7 +79,7 @@ def bars():
     """One row: isotropic, anisotropic, reference; both kernels with the same photons and paths."""
     from matplotlib import pyplot as plt
 
-    scene = mi.load_file(str(SCENES / "brushed_wall.xml"))
+    scene = mi.load_file(str(SCENES / "brushed_wall.xml"), optimize=False)
     compared = references.read(SCENES / "references" / "brushed_wall.exr")
     columns = []
     for kernel in ("isotropic", "anisotropic"):
@@ -117,9 +118,40 @@ def gallery():
     figure.savefig(SCENES / "pictures" / "gallery.png", dpi=100, pil_kwargs={"optimize": True})
 
 
+def bandwidth():
+    """Pictures above, the mean radius of each pixel's kernels below."""
+    from matplotlib import colors
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(
+        2, 2, figsize=(9.6, 7.3), dpi=100, facecolor="white", layout="constrained"
+    )
+    for (above, below), name in zip(axes.T, ("far_close", "glass_balls"), strict=True):
+        scene = mi.load_file(str(SCENES / f"{name}.xml"), optimize=False, width=320, height=240)
+        own = scene.integrator().parameters()
+        plugin = {"type": "aniso_pm", "map": "global", "passes": 16, "layers": "radius"}
+        image, plugin = render(scene, own | plugin, 16, 1)
+        radii = np.array(plugin.layers["radius"], dtype=np.float64).squeeze()
+        low, high = np.percentile(radii[radii > 0], (1, 99))
+        first = plugin.statistics["initial_radius"]
+        print(f"{name}: kernels of {low:.3g} to {high:.3g}, 60 photons within {first:.3g}")
+        above.imshow(srgb(0.8 * image / np.percentile(image, 95)))
+        above.set_title(name, fontsize=11)
+        shown = below.imshow(np.where(radii > 0, radii, np.nan), norm=colors.LogNorm(low, high))
+        below.set_title(f"radius; a disc of {first:.2g} holds 60 photons", fontsize=11)
+        ticks = np.geomspace(low, high, 5)
+        bar = figure.colorbar(shown, ax=below, orientation="horizontal", fraction=0.05, pad=0.02)
+        bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
+        bar.minorticks_off()
+        bar.set_label("world units")
+    for ax in axes.flat:
+        ax.set_axis_off()
+    figure.savefig(SCENES / "pictures" / "bandwidth.png", dpi=75, pil_kwargs={"optimize": True})
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    makers = {maker.__name__: maker for maker in (comparison, bars, gallery)}
+    makers = {maker.__name__: maker for maker in (comparison, bars, gallery, bandwidth)}
     parser.add_argument("what", nargs="+", choices=list(makers))
     mi.set_variant("llvm_ad_rgb")
     for name in parser.parse_args().what:
