@@ -15,7 +15,7 @@ import OpenEXR
 import pytest
 from aniso_pm import __version__, cli
 from aniso_pm.errors import one_line
-from aniso_pm.pictures.output import plain
+from aniso_pm.pictures.output import OutputError, plain
 from aniso_pm.rendering.state import State
 
 pytestmark = pytest.mark.usefixtures("without_pilot")
@@ -49,6 +49,8 @@ SCENE = """<scene version="3.0.0">
 </scene>
 """
 PATH = '<integrator type="path"><integer name="max_depth" value="$max_depth"/></integrator>'
+DEEP = ["-D", "max_depth=-1"]
+OTHER = ["--integrator", "aniso_pm", "-p"]
 OURS = """<integrator type="aniso_pm">
     <integer name="photon_count" value="20000"/> <integer name="max_depth" value="$max_depth"/>
   </integrator>"""
@@ -119,6 +121,14 @@ def assert_one_line(result, *parts):
         (["render", "scene.xml", "-o", "a.exr", "--target-error", "-1"], "--target-error"),
         (["render", "scene.xml", "-o", "a.exr", "--resume"], "--resume or --keep-state"),
         (["render", "scene.xml", "-o", "a.exr", "--first-pass", "3"], "--first-pass"),
+        (
+            ["reference", "scene.xml", "--spp", "4", *DEEP, "--integrator", "diffuse"],
+            "no integrator",
+        ),
+        (["render", "scene.xml", "-o", "n" * 252 + ".exr"], "File name too long"),
+        (["render", "scene.xml", "-o", "a.exr", *OTHER, "guard=1"], "boolean (true or false)"),
+        (["render", "scene.xml", "-o", "a.exr", *OTHER, "pases=2"], "did you mean passes?"),
+        (["cluster", "--task-seconds", "inf"], "--task-seconds"),
         (["merge", "-o", "a.exr"], "states"),
         (["merge", "x.state", "-o", "a.exr"], "x.state"),
         (["merge", "scene.xml", "-o", "a.exr"], "not a whole state file"),
@@ -291,11 +301,52 @@ def test_passes_rendered_apart_merge_into_the_whole(run, scene):
     assert_one_line(run("merge", "a.exr", "s.exr", "-o", "d.exr"), "seed was 7, is 0")
 
 
+def test_kept_states_are_not_lost(run, scene, tmp_path):
+    path = scene(OURS)
+    run("render", path, "-o", "a.exr", "--passes", 2, "--keep-state", "--quiet")
+    before = (tmp_path / "a.state").read_bytes()
+    for options in (["--passes", 2], ["--passes", 2, "--keep-state"], ["--spp", 1]):
+        assert_one_line(run("render", path, "-o", "a.exr", *options), "a.state", "--resume")
+    assert_one_line(run("merge", "a.exr", "-o", "a.exr"), "take the place of 'a.state'")
+    assert (tmp_path / "a.state").read_bytes() == before
+
+
+def test_a_state_that_cannot_be_written_does_not_cost_the_picture(run, scene, monkeypatch):
+    path = scene(OURS)
+
+    def full(self, path):
+        raise OutputError(f"cannot write '{path}': no space left")
+
+    monkeypatch.setattr(State, "save", full)
+    options = ["--passes", 3, "--save-every", "0.001"]
+    status, _, stderr = run("render", path, "-o", "a.exr", *options)
+    assert status == 1 and "no space left; the picture so far (3 passes) is written" in stderr
+    assert set(channels("a.exr")) > set("RGBA")
+
+
+def test_states_are_tried_before_anything_slow(run, scene, tmp_path):
+    (tmp_path / "a.state").mkdir()
+    options = ["-o", "a.exr", "--passes", "2", "--resume"]
+    assert_one_line(run("render", scene(OURS), *options), "a.state", "it is a directory")
+
+
+@pytest.mark.parametrize("command", [["inspect"], ["explain", "--pixel", "8,8"]])
+def test_scenes_without_integrator_are_examined_for_aniso_pm(run, scene, command):
+    status, stdout, stderr = run(*command, scene(""))
+    assert status == 0 and stdout, stderr
+
+
+def test_closed_streams_are_no_error(run, scene, monkeypatch):
+    for stream in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, stream, None)
+        assert cli.main(["render", str(scene()), "-o", "a.exr"]) == 0
+
+
 def test_the_command_line_replaces_the_scene_s_stopping_rules(run, scene):
     path = scene(OURS.replace("</integrator>", '<integer name="passes" value="2"/></integrator>'))
     _, stdout, _ = run("render", path, "-o", "a.exr", "--target-error", "0.5", "--json")
     assert json.loads(stdout)["statistics"]["passes"] == 4
-    _, stdout, _ = run("render", path, "-o", "a.exr", "--time", "0.001", "--json")
+    _, stdout, _ = run("render", path, "-o", "b.exr", "--time", "0.001", "--json")
     assert json.loads(stdout)["statistics"]["passes"] in (1, 2)  # compilation is not counted
 
 

@@ -125,3 +125,36 @@ def test_glass_over_a_floor_does_not_brighten_it():
     found, error = ratio(definition, 0.15)
     print(found, error)
     assert abs(found - 1) < 0.01 + 3 * error
+
+
+METAL = {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.05}}
+
+
+@pytest.mark.parametrize(
+    "thickness, bsdf", [(0, METAL), (0.01, METAL), (0.01, {"type": "diffuse"})]
+)
+def test_what_lies_on_a_floor_does_not_darken_it(thickness, bsdf):
+    """Kernels of the floor beside a sheet or a coin reach under it, where no photons are."""
+    T = mi.ScalarTransform4f
+    wall = T().translate([0, 1, 1]).rotate([1, 0, 0], 90)
+    flat = T().translate([0, 0, 0.001]).scale(0.3)
+    thick = T().translate([0, 0, thickness / 2]).scale([0.3, 0.3, thickness / 2])
+    definition = {
+        "type": "scene",
+        "sensor": looking_down(offset=0.38, fov=2.5),
+        "light": {"type": "point", "position": [0.3, 0.5, 1.5]},
+        "floor": {"type": "rectangle"},
+        "wall": {
+            "type": "rectangle",
+            "to_world": wall,
+            "bsdf": {"type": "diffuse", "reflectance": 0.9},
+        },
+        "thing": {
+            "type": "cube" if thickness else "rectangle",
+            "to_world": thick if thickness else flat,
+            "bsdf": bsdf,
+        },
+    }
+    found, error = ratio(definition, 0.15)
+    print(found, error)
+    assert abs(found - 1) < 0.015 + 3 * error

@@ -29,6 +29,8 @@ app = typer.Typer(
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the program with ``arguments`` (default: ``sys.argv``) and return its exit status."""
+    # Closed by who called us.
+    sys.stdout, sys.stderr = (s or open(os.devnull, "w") for s in (sys.stdout, sys.stderr))
     try:
         return app(args=arguments, prog_name="aniso-pm", standalone_mode=False) or 0
     except (InputError, output.OutputError) as error:

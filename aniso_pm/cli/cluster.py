@@ -16,20 +16,26 @@ def cluster(
     ] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of the film.")] = "640x480",
     pass_seconds: Annotated[
-        float | None, typer.Option(min=1e-3, help="Seconds of a pass on one worker.")
+        float | None, typer.Option(min=1e-3, max=1e6, help="Seconds of a pass on one worker.")
     ] = None,
-    task_seconds: Annotated[float, typer.Option(min=0.01, help="Seconds of a task.")] = 5.0,
+    task_seconds: Annotated[
+        float, typer.Option(min=0.01, max=1e6, help="Seconds of a task.")
+    ] = 5.0,
     save_every: Annotated[
-        float, typer.Option(min=1, help="Seconds between two times that sums come home.")
+        float, typer.Option(min=1, max=1e6, help="Seconds between two times that sums come home.")
     ] = 30.0,
     bandwidth: Annotated[
-        float, typer.Option(min=0.1, help="Megabytes a second between two machines.")
+        float, typer.Option(min=0.1, max=1e6, help="Megabytes a second between two machines.")
     ] = 117.0,
-    deaths: Annotated[float, typer.Option(min=0, help="Deaths of a worker in an hour.")] = 0.1,
+    deaths: Annotated[
+        float, typer.Option(min=0, max=1e3, help="Deaths of a worker in an hour.")
+    ] = 0.1,
     stragglers: Annotated[
         float, typer.Option(min=0, max=1, help="Share of tasks that take five times as long.")
     ] = 0.01,
-    seconds: Annotated[float, typer.Option(min=1, help="Length of the simulation.")] = 600.0,
+    seconds: Annotated[
+        float, typer.Option(min=1, max=86_400, help="Length of the simulation.")
+    ] = 600.0,
     measure: Annotated[
         bool, typer.Option("--measure", help="Measure the costs on this machine first.")
     ] = False,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import sys
 from collections import Counter
@@ -83,12 +84,16 @@ def parse_parameters(pairs: list[str] | None) -> dict[str, Any]:
 def _value(text: str) -> Any:
     if text in ("true", "false"):
         return text == "true"
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    try:
+        value = float(text)
+    except ValueError:
+        return text
+    # 1e6 is a number of photons as well.
+    return int(value) if value.is_integer() and "." not in text else value
 
 
 def set_variant(variant: str) -> None:
@@ -113,11 +118,13 @@ def load(
     sensor: int,
     integrator_name: str | None = None,
     parameters: dict[str, Any] | None = None,
+    needed: bool = True,
 ):
     """Scene, sensor and integrator; whatever is wrong with them is an InputError.
 
     integrator_name  plugin to take instead of the scene's own integrator.
     parameters       of that plugin, or to change those of an ``aniso_pm`` in the scene.
+    needed           else it is ``aniso_pm`` where the scene names none.
     """
     import mitsuba as mi
 
@@ -134,6 +141,8 @@ def load(
     if not isinstance(world, mi.Scene):
         raise InputError(f"{scene}: the file describes a {type(world).__name__}, not a scene")
     sensors = world.sensors()
+    if not needed and world.integrator() is None:
+        integrator_name = "aniso_pm"
     integrator = _integrator(scene, world.integrator(), integrator_name, parameters or {})
     if not sensors:
         raise InputError(f"{scene}: the scene has no sensor")
@@ -152,6 +161,7 @@ def _integrator(scene: Path, own, name: str | None, parameters: dict[str, Any]):
         raise InputError(f"{scene}: the scene names no integrator; give one, --integrator aniso_pm")
     if name is None and not parameters:
         return own
+    label = f"--integrator {name}" if name else "-p"
     if name is None:
         if not hasattr(own, "settings"):
             raise InputError(
@@ -162,13 +172,27 @@ def _integrator(scene: Path, own, name: str | None, parameters: dict[str, Any]):
         if {"time", "target_error"} & parameters.keys():
             del before["passes"]  # another rule takes its place, as in a scene
         name, parameters = "aniso_pm", before | parameters
+    if name == "aniso_pm":
+        _check_names(label, parameters)
     try:
         found = mi.load_dict({"type": name, **parameters})
     except Exception as error:
-        raise InputError(f"--integrator {name}: {one_line(error)}") from error
+        reason = re.sub(r"^.*failed to instantiate .*? of type \"\w+\": ", "", one_line(error))
+        raise InputError(f"{label}: {reason}") from error
     if not isinstance(found, mi.Integrator):
-        raise InputError(f"--integrator {name}: this plugin is no integrator")
+        raise InputError(f"{label}: this plugin is no integrator")
     return found
+
+
+def _check_names(label: str, parameters: dict[str, Any]) -> None:
+    """An InputError for the first name that is no parameter of aniso_pm."""
+    import mitsuba as mi
+
+    known = list(mi.load_dict({"type": "aniso_pm"}).parameters())
+    for name in parameters.keys() - known:
+        close = difflib.get_close_matches(name, known, 1)
+        there = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+        raise InputError(f"{label}: aniso_pm has no parameter '{name}'; {there}")
 
 
 @contextmanager

@@ -35,7 +35,7 @@ def inspect(
         raise InputError(f"{scene}: there is no such file")
     set_variant(variant)
     with mitsuba_log(quiet=False):
-        world, _, integrator = load(scene, parse_defines(define or []), 0)
+        world, _, integrator = load(scene, parse_defines(define or []), 0, needed=False)
         from aniso_pm.instruments import inspect as inspection
         from aniso_pm.rendering.prepared import prepare
         from aniso_pm.rendering.settings import Settings

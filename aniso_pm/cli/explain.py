@@ -50,7 +50,7 @@ def explain(
         raise InputError(f"{scene}: there is no such file")
     set_variant(variant)
     with mitsuba_log(quiet=False):
-        world, camera, integrator = load(scene, parse_defines(define or []), sensor)
+        world, camera, integrator = load(scene, parse_defines(define or []), sensor, needed=False)
         from aniso_pm.instruments import explain as explanation
 
         try:

@@ -78,7 +78,7 @@ def reference(
     defines = parse_defines(define or [])
     set_variant(variant)
     with mitsuba_log(quiet):
-        world, camera, _ = load(scene, defines, sensor)
+        world, camera, _ = load(scene, defines, sensor, needed=False)
         path = out or references.cache_path(scene, references.depends_on(world, camera))
         if not out:
             make_directory(path.parent)

@@ -119,6 +119,12 @@ def render(
     pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
     if not scene.is_file():
         raise InputError(f"{scene}: there is no such file")
+    state_file = out.with_suffix(".state")
+    if state_file.exists() and not resume:
+        raise InputError(
+            f"{state_file}: passes of an earlier rendering are there; --resume goes on with them, "
+            "or delete the file to start afresh"
+        )
 
     set_variant(variant)
     with mitsuba_log(quiet):
@@ -129,9 +135,12 @@ def render(
         rules = {"passes": passes, "time": seconds, "target_error": target_error}
         rules = {name: value for name, value in rules.items() if value is not None}
         kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state)
+        if kept is not None:
+            output.check_writable(state_file)
         _ask_for_layers(integrator, layer_names, denoise)
         from aniso_pm.rendering.film import pixel_weights
 
+        weights = pixel_weights(camera.film()) if denoise else [1.0]
         made_by = {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
 
         def write() -> dict[str, Any]:
@@ -141,11 +150,10 @@ def render(
             record["seconds"] = {"load": loaded - started, "render": now - loaded}
             variance = getattr(integrator, "variance", None)
             layers = getattr(integrator, "layers", None)
-            pictures.write(camera.film(), record, variance, layers, pixel_weights(camera.film()))
+            pictures.write(camera.film(), record, variance, layers, weights)
             return record
 
         # --- Render ---
-        state_file = out.with_suffix(".state")
         if kept is not None:
             from aniso_pm.rendering.state import Checkpoint
 
@@ -172,7 +180,7 @@ def render(
             _render(world, camera, integrator, seed, spp, quiet)
         record = write()
         statistics = record["statistics"]
-        if kept is False and not statistics["interrupted"]:
+        if kept is False and not statistics["interrupted"] and not statistics.get("failure"):
             state_file.unlink(missing_ok=True)
 
     if as_json:
@@ -231,6 +239,12 @@ def merge(
         for file in loaded:
             if loaded.count(file) > 1:
                 raise InputError(f"{file}: named twice")
+        ours = out.with_suffix(".state")
+        if str(ours) in loaded:
+            raise InputError(
+                f"{out}: its state would take the place of '{ours}', which is one of those to be "
+                "merged; give another output"
+            )
         total = State.load(Path(loaded[0]))
         for file in loaded[1:]:  # one after the other: there may be thousands of large ones
             total = merged({loaded[0]: total, file: State.load(Path(file))})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import tempfile
@@ -86,6 +87,10 @@ def connected(
     place = scheduler or str(scheduler_file)
     if scheduler_file is not None and not Path(scheduler_file).is_file():
         raise InputError(f"{scheduler_file}: there is no such file; does the scheduler run?")
+    if scheduler_file is not None and not _names_a_scheduler(scheduler_file):
+        raise InputError(f"{scheduler_file}: this is no file that `dask scheduler` has written")
+    if scheduler is not None:
+        _check_address(scheduler)
     given: dict[str, Any] = {"security": Security(require_encryption=True, **tls)} if tls else {}
     given["scheduler_file" if scheduler_file else "address"] = place
     # What goes wrong is said by us, in one line.
@@ -101,3 +106,25 @@ def connected(
             yield client
         finally:
             client.close()
+
+
+def _names_a_scheduler(file: Path) -> bool:
+    try:
+        return bool(json.loads(file.read_text())["address"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return False
+
+
+def _check_address(address: str) -> None:
+    """Before Dask's client, which would try for long and speak for itself."""
+    from distributed.comm.addressing import parse_address, parse_host_port
+
+    scheme, place = parse_address(address)
+    try:
+        if scheme in ("tcp", "tls"):
+            parse_host_port(place)
+    except ValueError as error:
+        raise InputError(
+            f"'{address}' is no address of a Dask scheduler ({one_line(error)}); it looks like "
+            "tcp://host:8786"
+        ) from error

@@ -98,6 +98,7 @@ def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
             emitters or ["the scene has no emitters"],
         ),
         _environment(scene),
+        _focus(scene),
         Finding(
             "aimed light paths",
             scene.aim is not None,
@@ -136,6 +137,18 @@ def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
         ),
     ]
     return [*findings, kernels(scene)] if compile_ else findings
+
+
+def _focus(scene: Prepared) -> Finding:
+    """Where light from outside begins."""
+    name, focus = "light from outside", scene.focus
+    if focus is not None:
+        x, y, z = focus.centre
+        sphere = f"a sphere of radius {focus.radius:.3g} around {x:.3g}, {y:.3g}, {z:.3g}"
+        return Finding(name, True, f"half of it begins above {sphere}, which the camera sees", [])
+    there = scene.needs_map and scene.emission is not None and scene.emission.from_outside
+    why = "begins evenly above the scene" if there else "no light path begins outside the scene"
+    return Finding(name, False, why, [])
 
 
 def _environment(scene: Prepared) -> Finding:

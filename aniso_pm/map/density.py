@@ -12,11 +12,11 @@ it is 0, and between parallel sheets it is twice their distance.
 
 m is the share of the kernel that lies on such a surface. Without it every estimate near an edge
 loses what its kernel spills over the edge. Points drawn from the kernel are probed by short rays
-along −n, through whatever covers the surface (glass that touches it), until the first one lands;
-the number of points is geometrically distributed with mean 1/m, so it *is* an estimate of 1/m,
-unbiased but for the end after PROBES_MAX points, at the price of one ray wherever the kernel spills
-nothing. A surface that goes on behind a wall counts as well, and so does one under metal that lies
-flat on it: there the estimate stays dark.
+along −n, through glass that covers the surface but not through what light does not pass, until the
+first one lands; the number of points is geometrically distributed with mean 1/m, so it *is* an
+estimate of 1/m, unbiased but for the end after PROBES_MAX points, at the price of one ray wherever
+the kernel spills nothing. A surface that goes on behind a wall counts as well, and so does one
+inside a solid that is higher than the slab: there the estimate stays dark.
 """
 
 from __future__ import annotations
@@ -255,8 +255,13 @@ class Surface:
 
 
 @dr.syntax
-def probe_surface(scene, seed: int, points: GatherPoints, kernel: PlaneKernel, thickness, active):
+def probe_surface(
+    scene, seed: int, points: GatherPoints, kernel: PlaneKernel, thickness, active, cover=None
+):
     """(1/m, nothing found?): the inverse share of each kernel that lies on the surface.
+
+    cover: a function of (mi.BSDFPtr, active) as ``receivers.read_cover``; None where every surface
+    gathers and none lets light pass.
 
     1 where none of PROBES_MAX points lay on one, which says more about the surface (finer than
     the slab, or than the resolution of its coordinates) than about its edges.
@@ -283,9 +288,15 @@ def probe_surface(scene, seed: int, points: GatherPoints, kernel: PlaneKernel, t
         cosine, d = dr.dot(si.n, n), si.p - points.p
         on_surface = si.is_valid() & (dr.abs(cosine) > NORMAL_COS)
         on_surface &= smooth_between(n, dr.mulsign(mi.Vector3f(si.n), cosine), d, rounding)
+        # Backs are passed: light arrives between them and the surface. So is glass, which is the
+        # surface where their faces coincide. Under all else no light arrives.
+        passes = cosine < 0
+        if cover is not None:
+            gathers, clear = cover(si.bsdf(), probing & si.is_valid())
+            passes |= clear
+            on_surface &= gathers | passes
         landed |= probing & on_surface
-        # What only covers the surface, glass that touches it for example, is passed.
         depth += si.t + 1e-3 * height + rounding
-        fresh = ~si.is_valid() | (depth >= 2 * height)
+        fresh = ~(si.is_valid() & passes) | (depth >= 2 * height)
         probing &= ~on_surface & (~fresh | (tries < PROBES_MAX))
     return dr.select(landed, mi.Float(tries), 1), active & ~landed

@@ -15,6 +15,8 @@ The split changes noise, never energy: both parts together are the BSDF.
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 import drjit as dr
 import mitsuba as mi
 
@@ -124,6 +126,19 @@ def read_bent(bsdf, active):
 
     def read(instance, active):
         return mi.Bool(instance is not None and is_bent(instance))
+
+    return dr.dispatch(bsdf, read, active)
+
+
+def read_cover(bsdf, active, receivers: Container[int]):
+    """(is it one of the receivers?, does light pass?) per lane of mi.BSDFPtr. receivers: addresses
+    of BSDFs."""
+
+    def read(instance, active):
+        if instance is None:
+            return mi.Bool(False), mi.Bool(True)
+        passes = mi.has_flag(instance.flags(), mi.BSDFFlags.Transmission)
+        return mi.Bool(instance.ptr in receivers), mi.Bool(passes)
 
     return dr.dispatch(bsdf, read, active)
 

@@ -49,12 +49,12 @@ def sweep(path: Path) -> None:
 
 def check_writable(path: Path) -> None:
     """Raise :class:`OutputError` unless a file can be put at ``path``, by trying it beside it."""
-    if path.is_dir():
-        raise OutputError(f"cannot write '{path}': it is a directory")
-    if not path.parent.is_dir():
-        raise OutputError(f"cannot write '{path}': there is no directory '{path.parent}'")
     partial = _partial(path, os.getpid())
     try:
+        if path.is_dir():
+            raise OutputError(f"cannot write '{path}': it is a directory")
+        if not path.parent.is_dir():
+            raise OutputError(f"cannot write '{path}': there is no directory '{path.parent}'")
         partial.touch()
         partial.unlink()
     except OSError as error:
@@ -133,7 +133,8 @@ def _with_layers(bitmap, layers: Mapping[str, Any]):
     parts = [pixels.reshape(*pixels.shape[:2], -1)]
     names = [part.name for part in bitmap.struct_()]
     for layer, values in layers.items():
-        parts.append(np.asarray(values, dtype=np.float32))
+        with np.errstate(over="ignore"):  # squares of what is above 1e19
+            parts.append(np.asarray(values, dtype=np.float32))
         count = values.shape[2]
         # Sums are R, G, B, whatever the film makes of them, unless it is a spectral one.
         own = [name for name in names if "." not in name][:count]

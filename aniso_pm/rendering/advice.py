@@ -35,9 +35,10 @@ def before(scene: Prepared) -> None:
     _large_radius(scene)
     passes = scene.settings.passes
     if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
+        few = f"{passes} passes" if passes > 1 else "one pass"
         mi.Log(
             mi.LogLevel.Warn,
-            f"aniso_pm: all light of a pass shares four wavelengths; {passes} passes will give "
+            f"aniso_pm: all light of a pass shares four wavelengths; {few} will give "
             f'wrong colours, set the parameter "passes" to {_SPECTRAL_PASSES} or more',
         )
 
@@ -56,6 +57,13 @@ def after(scene: Prepared, statistics: dict[str, Any]) -> None:
             mi.LogLevel.Warn,
             f"aniso_pm: {statistics['eye_samples_rejected']} of {statistics['eye_samples']} eye "
             "samples were not finite and count as black",
+        )
+    if emitted and not statistics["photons_stored"]:
+        lost = "light over glass, mirrors and metal" if statistics["map"] == "caustic" else "light"
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"aniso_pm: none of {emitted} light paths left a photon; if {lost} should reach what "
+            'the camera sees, it is missing: give more of them (parameter "photon_count")',
         )
     points = statistics["gather_points"]
     if scene.settings.initial_radius and points and statistics["photons_stored"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import mitsuba as mi
@@ -73,6 +73,7 @@ class Decided:
             "photon_count": settled.count,
             "photon_count_automatic": given.photon_count == 0,
             "aim": settled.aim and settled.aim.gains(),
+            "focus": settled.focus and asdict(settled.focus),
             "map": settled.use,
             "map_errors": settled.errors,
             "kernel": "anisotropic" if self.scene.follow_lobes else "isotropic",

@@ -12,6 +12,7 @@ import mitsuba as mi
 from ..map import density, photon_word
 from ..map.photon_map import flux_bytes
 from ..transport import emission, layers
+from ..transport.focus import Focus
 from ..transport.uses import Use
 from .needs import Needs
 from .settings import Settings
@@ -28,6 +29,7 @@ class Decisions:
     emission: emission.Emission | None
     chosen: Use | None = None  # use of the map that a pilot has found best, see ``undecided``
     lobes_matter: bool = True  # kernels that follow lobes: a pilot may find that they do not
+    focus: Focus | None = None  # where light from outside begins; None: anywhere
 
     @property
     def extent(self) -> float:

@@ -24,7 +24,7 @@ class Needs:
     lobes      surfaces with a readable roughness that may be anisotropic.
     chains     surfaces that paths walk on, so that a gather point may lie deeper than the first
                vertex, and caustics exist.
-    receivers  surfaces that photons are stored on.
+    receivers  surfaces that photons are stored on; receiving: addresses of their BSDFs.
     general    receivers that are not Lambertian.
     bent       surfaces with bump or normal maps.
     unreadable glossy surfaces whose roughness cannot be read: kernels behind them are discs.
@@ -35,6 +35,7 @@ class Needs:
     lobes: list[str] = field(default_factory=list)
     chains: list[str] = field(default_factory=list)
     receivers: list[str] = field(default_factory=list)
+    receiving: set[int] = field(default_factory=set)
     general: list[str] = field(default_factory=list)
     bent: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
@@ -78,6 +79,7 @@ def read_scene(scene, gather_roughness: float) -> Needs:
         evidence = f"{', '.join(names[bsdf.ptr])}: {describe(bsdf)}"
         if may_gather(bsdf, gather_roughness):
             needs.receivers.append(evidence)
+            needs.receiving.add(bsdf.ptr)
         if is_lambertian(bsdf):
             continue
         if may_gather(bsdf, gather_roughness):

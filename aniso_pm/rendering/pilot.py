@@ -19,6 +19,7 @@ from ..map import density
 from ..map.gather_points import take
 from ..map.photon_map import EMPTY
 from ..transport import aim
+from ..transport.focus import Focus, find
 from ..transport.uses import Use
 from . import footprint, survey
 from .film import one_each, sample_ray, wavelengths
@@ -64,6 +65,7 @@ class Settled:
     widths  of the kernels of each pixel, in pixels (see ``footprint``).
     aim     of light paths (aim.Learned), or None: they begin evenly.
     lobes   part of the error that kernels make which follow lobes (see ``plan``).
+    focus   where light from outside begins, or None: anywhere.
     """
 
     use: Use
@@ -76,12 +78,14 @@ class Settled:
     widths: np.ndarray
     aim: aim.Learned | None
     lobes: float
+    focus: Focus | None = None
 
     def applied(self, scene: Prepared) -> Prepared:
         """The scene with the use of its map, with or without lobes, and with the number and aim of
         light paths."""
         matter = self.lobes >= WORTH_FOLLOWING or not scene.lobes_are_dispensable
         aimed = self.aim.aim() if self.aim else None
+        scene = scene.focused(self.focus)
         scene = replace(scene, chosen=self.use, aim=aimed, lobes_matter=matter)
         return scene.with_(photon_count=self.count)
 
@@ -96,6 +100,8 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
     count, radius = scene.settings.photon_count, scene.settings.initial_radius
     if scene.undecided:
         scene = replace(scene, chosen="survey")
+    focus = _focus(scene, sensor, seed)
+    scene = scene.focused(focus)
     pilot = scene.with_(photon_count=_PATHS)
     maps = [
         pilot.photon_map(stream_seed(seed, PILOT), k, 0, colours, remember=True)
@@ -123,7 +129,17 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
         widths=found.widths,
         aim=found.aim,
         lobes=round(found.lobes, 2),
+        focus=focus,
     )
+
+
+def _focus(scene: Prepared, sensor, seed: int) -> Focus | None:
+    """The part of the scene that light from outside is to meet."""
+    if not (scene.needs_map and scene.emission and scene.emission.from_outside):
+        return None
+    si = scene.scene.ray_intersect(camera_rays(sensor, seed), mi.RayFlags.Minimal, True)
+    points = np.array(si.p).T[si.is_valid().numpy()]
+    return find(points.astype(np.float64), 0.5 * scene.extent)
 
 
 def _rounded(number: float) -> int:
@@ -177,10 +193,10 @@ def radius_at(points, map_, scene: Prepared, light_paths: float) -> float:
     """Bandwidth (world units) at which kernels hold PHOTONS_PER_KERNEL photons of so many light
     paths, in the median over gather points (GatherPoints or None).
 
-    Returns a hundredth of the scene's extent where there is nothing to gather, and never more than
-    a tenth of it.
+    Returns a hundredth of the extent of the scene (or of its part that light from outside is to
+    meet) where there is nothing to gather, and never more than a tenth of it.
     """
-    extent = scene.extent
+    extent = min(scene.extent, 2 * scene.focus.radius) if scene.focus else scene.extent
     if points is None or not map_.stored:
         return 0.01 * extent
     count = dr.width(points.lane)

@@ -15,9 +15,11 @@ from ..errors import Unsupported
 from ..map import density, summed
 from ..map.gather_points import GatherPoints, map_tree, take
 from ..map.photon_map import EMPTY, PhotonMap
+from ..map.receivers import read_cover
 from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
 from ..transport.amends import repair_bounds
+from ..transport.focus import Focus
 from ..transport.gathered_layers import split
 from ..transport.thinning import Thinning
 from ..transport.walk import WalkOptions
@@ -73,6 +75,12 @@ class Prepared(Decisions):
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
         return replace(self, settings=self.settings.with_(**changes))
+
+    def focused(self, focus: Focus | None) -> Prepared:
+        """The same scene with light from outside begun above a part of it."""
+        if focus is None or self.emission is None:
+            return self
+        return replace(self, focus=focus, emission=self.emission.focused(focus))
 
     def thawed(self) -> Prepared:
         """The same scene with nothing frozen."""
@@ -241,8 +249,10 @@ class Prepared(Decisions):
             )
         lost = mi.Bool(False)
         if self.settings.edge_compensation:
+            receivers = self.needs.receiving
+            cover = partial(read_cover, receivers=receivers) if self.deep else None
             inverse, lost = density.probe_surface(
-                self.scene, seed, points, kernel, thickness, count > 0
+                self.scene, seed, points, kernel, thickness, count > 0, cover
             )
             L *= inverse
             light = map_tree(lambda part: part * inverse, light)

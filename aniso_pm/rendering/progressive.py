@@ -13,7 +13,10 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import mitsuba as mi
+
 from ..errors import Failed, is_interrupt
+from ..pictures.output import OutputError
 from . import advice, memory, state
 from . import film as films
 from .accumulate import mean_and_variance, relative_standard_error
@@ -35,7 +38,8 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
 
     Ctrl-C ends rendering: the film then holds all passes that were finished, or the wavefronts of
     the first one, and statistics["interrupted"] is True. It is raised on where there is nothing.
-    A ``Failed`` of those who render the passes ends it likewise; statistics["failure"] is its text.
+    A ``Failed`` of those who render the passes ends it likewise; statistics["failure"] is its text,
+    or that of the error that kept the state from the disk.
     Raises state.StateError where the checkpoint's state is not one of this rendering.
     """
     run = Run(scene, sensor, seed, spp, controls, statistics)
@@ -232,12 +236,21 @@ class Run:
             with self.stopping.not_counted():
                 callback(index, self.film.develop(), dict(self.statistics))
         if due:
+            self._save()
+        if due or callback:
+            self.clock.lap("output")
+
+    def _save(self):
+        """State and picture so far to the disk, if there is room; rendering goes on anyway."""
+        checkpoint = self.controls.checkpoint
+        try:
             checkpoint.write(self._state())
             if checkpoint.on_write:
                 with self.stopping.not_counted():
                     checkpoint.on_write()
-        if due or callback:
-            self.clock.lap("output")
+        except OutputError as error:
+            checkpoint.put_off()
+            mi.Log(mi.LogLevel.Warn, f"aniso_pm: {error}; rendering goes on")
 
     def _state(self) -> state.State:
         return state.State(
@@ -260,14 +273,19 @@ class Run:
         return self.done.sums is not None
 
     def finish(self):
-        """The picture into the film, the state to the disk."""
+        """The picture into the film, the state to the disk: a picture is not lost because its
+        state cannot be kept."""
         self.statistics |= self.done.counts
         if self.done.sums is not None:
             films.show(self.film, self.done.sums.film_tensor())
         if self.done.passes:
             self._estimate_error()
             if self.controls.checkpoint:
-                self.controls.checkpoint.write(self._state())
+                try:
+                    self.controls.checkpoint.write(self._state())
+                except OutputError as error:
+                    self.statistics["failure"] = str(error)
+                    mi.Log(mi.LogLevel.Warn, f"aniso_pm: {error}")
 
     def rendered(self) -> Rendered:
         """What is left."""

@@ -48,7 +48,8 @@ class Settings:
             if wanted is float and type(value) is int:
                 object.__setattr__(self, field.name, float(value))
             elif type(value) is not wanted:
-                name = {bool: "boolean", int: "integer", float: "float", str: "string"}[wanted]
+                kinds = {bool: "boolean (true or false)", int: "integer", float: "float"}
+                name = kinds.get(wanted, "string")
                 raise TypeError(
                     f'aniso_pm: parameter "{field.name}" must be of type {name}, '
                     f"got {value!r} ({type(value).__name__})"

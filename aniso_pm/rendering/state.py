@@ -13,6 +13,7 @@ import hashlib
 import io
 import json
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -114,14 +115,13 @@ class State:
                 arrays = {name: archive[name] for name in (*_ARRAYS, *there)}
             version, checksum = header["version"], header.pop("sha256")
         except Exception as error:
-            reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-            raise StateError(
-                f"{path}: not a whole state file ({reason}); delete it to start afresh"
-            ) from error
+            whole = zipfile.is_zipfile(io.BytesIO(data))
+            reason = "damaged, or of something else" if whole else "cut short, or of another kind"
+            raise StateError(f"{path}: not a whole state file ({reason})") from error
         if version != VERSION:
             raise StateError(f"{path}: state format {version}; this version reads {VERSION}")
         if checksum != _checksum(header, arrays):
-            raise StateError(f"{path}: checksum mismatch, damaged; delete it to start afresh")
+            raise StateError(f"{path}: checksum mismatch, damaged")
         kept = ("identity", "film", "passes", "seconds", "statistics")
         return State(**{name: header[name] for name in kept}, arrays=arrays)
 
@@ -247,6 +247,14 @@ class Checkpoint:
             return State.load(self.path)
         except FileNotFoundError:
             return None
+        except StateError as error:
+            raise StateError(f"{error}; delete it to start afresh") from error
+        except OSError as error:
+            raise StateError(f"cannot read '{self.path}': {error.strerror or error}") from error
+
+    def put_off(self) -> None:
+        """The next write is to come as late as if this one had succeeded."""
+        self._written = time.perf_counter()
 
     def due(self) -> bool:
         return time.perf_counter() - self._written > max(self.every, 20 * self._cost)

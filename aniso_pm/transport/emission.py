@@ -38,6 +38,7 @@ from ..map.spectra import channel_mean
 from ..ndf import children
 from .amends import Amends, amends
 from .emitters import refuse, refuse_scale
+from .focus import Discs, Focus
 
 _FLOOR = 0.05
 _PILOT_RAYS = 256
@@ -46,18 +47,17 @@ _PILOT_SEED = 0xE317
 
 @dataclass(frozen=True)
 class Environment:
-    """The emitter that surrounds a scene, and the scene's bounding sphere (world units)."""
+    """The emitter that surrounds a scene, and the scene's bounding sphere (world units). discs:
+    where its rays begin, or None: anywhere."""
 
     emitter: Any
     centre: Any
     radius: Any
+    discs: Discs | None = None
 
     @staticmethod
     def of(scene) -> Environment:
-        sphere = scene.bbox().bounding_sphere()
-        centre, radius = mi.Point3f(sphere.center), mi.Float(sphere.radius * (1 + 1e-4))
-        dr.make_opaque(centre, radius)
-        return Environment(scene.environment(), centre, radius)
+        return Environment(scene.environment(), *_sphere(scene))
 
     def sample_ray(self, time, u1, u2, u3, active=True, wavelengths=None):
         """(ray, flux) as ``mi.Emitter.sample_ray`` has them, from the direction's sampling (see
@@ -70,8 +70,12 @@ class Environment:
         if mi.is_spectral:
             si.wavelengths = wavelengths
         ds, radiance = self.emitter.sample_direction(si, u3, active)
-        offset = mi.warp.square_to_uniform_disk_concentric(u2)
-        across = mi.Frame3f(ds.d).to_world(mi.Vector3f(offset.x, offset.y, 0))
+        if self.discs is not None:
+            across, spread = self.discs.sample(u2, ds.d)
+            weight = weight * spread
+        else:
+            offset = mi.warp.square_to_uniform_disk_concentric(u2)
+            across = mi.Frame3f(ds.d).to_world(mi.Vector3f(offset.x, offset.y, 0))
         origin = self.centre + self.radius * (ds.d + across)
         ray = mi.Ray3f(origin, -ds.d, time, si.wavelengths)
         return ray, radiance * weight * (dr.pi * dr.square(self.radius))
@@ -93,6 +97,14 @@ class Environment:
         return 4 * float((dr.sum(inside) / dr.sum(flux))[0])
 
 
+def _sphere(scene):
+    """Centre and radius of the scene's bounding sphere, world units, a little wider."""
+    sphere = scene.bbox().bounding_sphere()
+    centre, radius = mi.Point3f(sphere.center), mi.Float(sphere.radius * (1 + 1e-4))
+    dr.make_opaque(centre, radius)
+    return centre, radius
+
+
 def _random(count: int):
     """The numbers that a ray takes: u1, u2, u3."""
     sampler = mi.load_dict({"type": "independent"})
@@ -107,6 +119,9 @@ class Emission:
     textured     in spectral variants: do any emitting surfaces have textures?
     environment  Environment, or None where nothing surrounds the scene.
     amends       what the emitters' own rays need to be right, or None.
+    share        of the power, of each emitter.
+    suns         where rays of emitters begin that are infinitely far in one direction, or None:
+                 anywhere.
     """
 
     scene: Any
@@ -115,6 +130,29 @@ class Emission:
     textured: bool
     environment: Environment | None
     amends: Amends | None = None
+    share: tuple[float, ...] = ()
+    suns: Discs | None = None
+
+    @property
+    def from_outside(self) -> bool:
+        """Is there light from infinitely far away?"""
+        return any(_is_far(e) for e in self.scene.emitters())
+
+    def focused(self, focus: Focus | None) -> Emission:
+        """The same light, most of it begun above a part of the scene (see ``focus``)."""
+        if focus is None:
+            return self
+        discs = Discs.of(focus, *_sphere(self.scene))
+        far = np.array([_is_far(e) for e in self.scene.emitters()])
+        around = self.environment and replace(self.environment, discs=discs)
+        suns = discs if any(_is_sun(e) for e in self.scene.emitters()) else None
+        found = replace(self, environment=around, suns=suns)
+        if self.choose is None:
+            return found
+        # What each gives to that part.
+        share = np.array(self.share) * np.where(far, discs.weight, 1)
+        seen = self.choose.pmf.numpy() > 0
+        return replace(found, choose=_chances(share, seen))
 
     def sample_ray(self, time, u1, u2, u3, active=True, wavelengths=None):
         """(ray, flux, emitter) of light paths; see ``mi.Scene.sample_emitter_ray``.
@@ -146,6 +184,11 @@ class Emission:
     def _from_surfaces(self, index, emitter, time, u1, u2, u3, active, wavelengths):
         """(ray, flux) from emitters inside the scene, or infinitely far in one direction."""
         ray, flux = emitter.sample_ray(time, u1, u2, u3, active)
+        if self.suns is not None:
+            sun = _is_sun(emitter)
+            across, spread = self.suns.sample(u2, ray.d)
+            origin = self.suns.centre + self.suns.radius * (across - ray.d)
+            ray.o, flux = dr.select(sun, origin, ray.o), flux * dr.select(sun, spread, 1)
         if self.amends is not None:
             ray, flux = self.amends(index, ray, flux, active)
         if wavelengths is not None:
@@ -218,9 +261,24 @@ def prepare(scene) -> Emission:
     flux = dr.select(dr.isfinite(flux), flux, 0)
     power = dr.block_sum(flux, _PILOT_RAYS).numpy().astype(np.float64) * weight
     share = power / power.sum() if power.sum() > 0 else seen / seen.sum()
-    chances = (1 - _FLOOR) * share + _FLOOR * seen / seen.sum()
-    choose = mi.DiscreteDistribution(own(mi.Float, chances.astype(np.float32)))
-    return replace(even, choose=choose)
+    return replace(even, choose=_chances(share, seen), share=tuple(share.tolist()))
+
+
+def _chances(share, seen) -> mi.DiscreteDistribution:
+    """Of the emitters, from their shares of the power; seen: those that have any light."""
+    chances = (1 - _FLOOR) * share / share.sum() + _FLOOR * seen / seen.sum()
+    return mi.DiscreteDistribution(own(mi.Float, chances.astype(np.float32)))
+
+
+def _is_far(emitter) -> bool:
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+
+
+def _is_sun(emitter):
+    """Light from infinitely far in one direction. Takes mi.EmitterPtr or an mi.Emitter."""
+    flags = emitter.flags()
+    has = lambda flag: mi.has_flag(flags, flag)  # noqa: E731
+    return has(mi.EmitterFlags.Infinite) & has(mi.EmitterFlags.DeltaDirection)
 
 
 def only_photons_see(emitter):

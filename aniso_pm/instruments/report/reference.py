@@ -202,9 +202,12 @@ def _independent(name: str, limits: dict[str, Any]):
         key: value for key, value in limits.items() if value != {"max_depth": -1}.get(key, False)
     }
     try:
-        return mi.load_dict({"type": name, **given})
+        found = mi.load_dict({"type": name, **given})
     except Exception as error:
         raise InputError(f'integrator "{name}" cannot be used here: {one_line(error)}') from error
+    if not isinstance(found, mi.Integrator):
+        raise InputError(f'"{name}" is no integrator')
+    return found
 
 
 def _wave_seed(seed: int, number: int) -> int:
