@@ -40,6 +40,7 @@ class Row:
     reference  integrator that converges on it.
     spp        samples per pixel of a reference render.
     whole      compare all light, not the indirect light alone.
+    passes     of ours, as many as its noise of photons takes.
     """
 
     light: str = "area"
@@ -48,6 +49,7 @@ class Row:
     reference: str = "path"
     spp: int = 4096
     whole: bool = False
+    passes: int = 4
 
 
 def T():
@@ -408,6 +410,7 @@ def rows():
                     "bsdf": {"type": "twosided", "b": diffuse},
                 }
             },
+            passes=16,
         ),
         # --- materials under other lights ---
         "rough metal under a point": Row("point", ball(rough)),
@@ -442,9 +445,10 @@ def mean_and_error(row, integrator, spp, seeds):
     return float(np.mean(values)), float(np.std(values, ddof=1) / len(values) ** 0.5)
 
 
-def compare(row, use, expected, seeds=range(8), passes=4, share=8):
+def compare(row, use, expected, seeds=range(8), passes=None, share=8):
     """(ratio of our energy to the reference's, standard error of both together). We take 1/share
-    of the reference's samples per pixel."""
+    of the reference's samples per pixel, in so many passes; None: in those of the row."""
+    passes = passes or row.passes
     integrator = PHOTON_MAPPER | USES[use] | {"passes": passes}
     mean, error = mean_and_error(row, integrator, max(row.spp // share, passes), seeds)
     return mean / expected[0], math.hypot(error, expected[1]) / expected[0]
