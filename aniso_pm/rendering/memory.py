@@ -104,7 +104,7 @@ def _points_per_sample(scene: Prepared) -> float:
         return 0
     if scene.use == "caustic":
         return 6  # 4 and buffers that grew
-    return 2 if scene.use == "final_gather" else 1 + 0.2 * bool(scene.needs.general)
+    return 1.2 if scene.use == "final_gather" or scene.needs.general else 1
 
 
 def plan(scene: Prepared, job: Job, count_photons: Callable[[], float]) -> Plan:
