@@ -138,3 +138,27 @@ def test_an_irradiance_meter_is_a_sensor_like_others(rgb):
     ours = array(mi.render(scene, integrator=integrator(), spp=16_384)).mean()
     path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=16_384)).mean()
     assert ours == pytest.approx(path, rel=0.1)
+
+
+def checkered_lamp():
+    """Mitsuba draws no points by this texture."""
+    definition = room({"bulb": {"type": "point", "intensity": 0.1}}, size=8)
+    tiles = mi.ScalarTransform4f().scale([3, 3, 1])
+    texture = {"type": "checkerboard", "color0": 0.0, "color1": 20.0, "to_uv": tiles}
+    definition["light"]["emitter"] = {"type": "area", "radiance": texture}
+    return mi.load_dict(definition)
+
+
+def test_a_lamp_with_any_texture_shines(rgb):
+    scene, path = checkered_lamp(), mi.load_dict({"type": "path"})
+    ours = [mi.render(scene, integrator=integrator(), spp=256, seed=k) for k in range(4)]
+    ratios = np.mean(ours, axis=(1, 2, 3)) / np.mean(mi.render(scene, integrator=path, spp=16_384))
+    print(ratios)
+    assert abs(ratios.mean() - 1) < 0.005 + 3 * ratios.std(ddof=1) / 2
+
+
+def test_a_texture_that_cannot_be_drawn_from_is_named_in_spectral_variants(
+    variant_llvm_spectral,
+):
+    with pytest.raises(ValueError, match="texture from which Mitsuba cannot draw.*RGB variant"):
+        integrator().render(checkered_lamp(), spp=1)

@@ -27,6 +27,7 @@ Environments are sampled at λ to begin with.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -34,6 +35,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import own
+from ..errors import Unsupported, one_line
 from ..map.spectra import channel_mean
 from ..ndf import children
 from .amends import Amends, amends
@@ -120,6 +122,7 @@ class Emission:
     environment  Environment, or None where nothing surrounds the scene.
     amends       what the emitters' own rays need to be right, or None.
     share        of the power, of each emitter.
+    evaluated    addresses of the surfaces with a texture that Mitsuba cannot draw from.
     suns         where rays of emitters begin that are infinitely far in one direction, or None:
                  anywhere.
     """
@@ -131,6 +134,7 @@ class Emission:
     environment: Environment | None
     amends: Amends | None = None
     share: tuple[float, ...] = ()
+    evaluated: frozenset[int] = frozenset()
     suns: Discs | None = None
 
     @property
@@ -183,7 +187,11 @@ class Emission:
 
     def _from_surfaces(self, index, emitter, time, u1, u2, u3, active, wavelengths):
         """(ray, flux) from emitters inside the scene, or infinitely far in one direction."""
-        ray, flux = emitter.sample_ray(time, u1, u2, u3, active)
+        if self.evaluated:
+            leave = partial(_leave_evaluated, self.evaluated)
+            ray, flux = dr.dispatch(emitter, leave, time, u1, u2, u3, active)
+        else:
+            ray, flux = emitter.sample_ray(time, u1, u2, u3, active)
         if self.suns is not None:
             sun = _is_sun(emitter)
             across, spread = self.suns.sample(u2, ray.d)
@@ -210,6 +218,40 @@ class Emission:
         si.wavelengths = wavelengths
         radiance = dr.dispatch(emitter, _spectrum, si, active)
         return radiance * dr.select(drawn > 0, dr.sum(flux) / drawn, 0)
+
+
+def _leave_evaluated(evaluated, emitter, time, u1, u2, u3, active):
+    """(ray, flux) of Mitsuba's emitters; of the evaluated ones by a point that is uniform on the
+    shape, a direction by the cosine, and the radiance there."""
+    if emitter is None:
+        return dr.zeros(mi.Ray3f), mi.Spectrum(0)
+    if emitter.ptr not in evaluated:
+        return emitter.sample_ray(time, u1, u2, u3, active)
+    sample = emitter.get_shape().sample_position(time, u2, active)
+    si = mi.SurfaceInteraction3f(sample, dr.zeros(mi.Color0f))
+    si.wi = mi.warp.square_to_cosine_hemisphere(u3)
+    flux = emitter.eval(si, active) * (dr.pi / sample.pdf)
+    return si.spawn_ray(si.to_world(si.wi)), flux
+
+
+def _cannot_be_drawn(emitter) -> bool:
+    """Does Mitsuba draw no points by the texture of this surface? (Checkerboards, for example.)"""
+    if not (emitter.get_shape() and _varies(emitter)):
+        return False
+    try:
+        emitter.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
+    except RuntimeError as error:
+        if mi.is_spectral:
+            raise Unsupported(
+                f'aniso_pm: emitter "{emitter.id()}" has a texture from which Mitsuba cannot draw '
+                f"({one_line(error)}); use a bitmap or an RGB variant"
+            ) from error
+        return True
+    return False
+
+
+def _varies(emitter) -> bool:
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
 def _spectrum_over_density(emitter, si, u, active):
@@ -244,15 +286,16 @@ def prepare(scene) -> Emission:
     found = amends(scene)
     emitters = scene.emitters_dr()
     count = dr.width(emitters)
-    varying = int(mi.EmitterFlags.Surface) | int(mi.EmitterFlags.SpatiallyVarying)
-    textured = any((e.flags() & varying) == varying for e in scene.emitters())
+    textured = any(e.get_shape() is not None and _varies(e) for e in scene.emitters())
+    evaluated = frozenset(e.ptr for e in scene.emitters() if _cannot_be_drawn(e))
+    all_ = Emission(scene, emitters, None, textured, environment, found, evaluated=evaluated)
     if count == 1:
-        return Emission(scene, emitters, None, textured, environment, found)
+        return all_
     weight = np.array([e.sampling_weight() for e in scene.emitters()])
     delta = np.array([mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in scene.emitters()])
     seen = ~delta | (weight > 0)
     alike = mi.DiscreteDistribution(dr.ones(mi.Float, count))
-    even = Emission(scene, emitters, alike, textured, environment, found)
+    even = replace(all_, choose=alike)
     index = dr.arange(mi.UInt32, count * _PILOT_RAYS) // _PILOT_RAYS
     emitter = dr.gather(mi.EmitterPtr, emitters, index)
     u1, u2, u3 = _random(count * _PILOT_RAYS)
