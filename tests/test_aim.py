@@ -156,7 +156,7 @@ def test_the_same_light_arrives(variant_llvm_rgb, name):
     world, prepared, settled = found_in(name)
     assert settled.aim is not None and settled.aim.variance * settled.aim.work < 0.7
     even = replace(prepared.with_(photon_count=100_000), chosen="global")
-    aimed = replace(even, aim=settled.aim.aim())
+    aimed = replace(even.focused(settled.focus), aim=settled.aim.aim())
 
     def power(scene, seed):
         """Of all photons, and of those on the plate."""
