@@ -189,7 +189,7 @@ def _check_names(label: str, parameters: dict[str, Any]) -> None:
     import mitsuba as mi
 
     known = list(mi.load_dict({"type": "aniso_pm"}).parameters())
-    for name in parameters.keys() - known:
+    for name in [name for name in parameters if name not in known]:
         close = difflib.get_close_matches(name, known, 1)
         there = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
         raise InputError(f"{label}: aniso_pm has no parameter '{name}'; {there}")

@@ -240,7 +240,7 @@ def merge(
             if loaded.count(file) > 1:
                 raise InputError(f"{file}: named twice")
         ours = out.with_suffix(".state")
-        if str(ours) in loaded:
+        if ours.resolve() in [Path(file).resolve() for file in loaded]:
             raise InputError(
                 f"{out}: its state would take the place of '{ours}', which is one of those to be "
                 "merged; give another output"
