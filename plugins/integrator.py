@@ -287,7 +287,12 @@ class AnisoPhotonMapper:
         """Render the scene; see ``mi.Integrator.render``. With several passes ``spp`` is their
         total, and without a limit to their number that of each."""
         if not isinstance(sensor, mi.Sensor):
-            sensor = scene.sensors()[int(sensor)]
+            sensors = scene.sensors()
+            if not 0 <= int(sensor) < len(sensors):
+                raise IndexError(
+                    f"aniso_pm: sensor {sensor}: the scene has {len(sensors)}, counted from 0"
+                )
+            sensor = sensors[int(sensor)]
         self.statistics, self.variance, self._last_map, self.layers = {}, None, None, {}
         with dr.suspend_grad():
             prepared = prepare(scene, self.settings, self.hide_emitters)

@@ -1,11 +1,14 @@
-"""Fixtures that set a Mitsuba variant for one test and set the earlier one again afterwards."""
+"""Fixtures that set a Mitsuba variant for one test and the earlier one afterwards, and that run the
+program `aniso-pm`."""
 
 import aniso_pm  # noqa: F401  (before drjit, so that it can choose LLVM)  # isort: skip
 import time
 
+import command_line
 import mitsuba as mi
 import numpy as np
 import pytest
+from aniso_pm import cli
 from aniso_pm.rendering.pilot import Settled
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral")
@@ -89,3 +92,33 @@ def tick(monkeypatch):
 
     monkeypatch.setattr(time, "perf_counter", lambda: pass_by(0.001))
     return pass_by
+
+
+# --- The program aniso-pm ---
+
+
+@pytest.fixture
+def run(tmp_path, capfd, monkeypatch):
+    """Run the program in this process, in an empty directory: (status, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+    before = mi.variant()
+
+    def run(*arguments):
+        status = cli.main([str(argument) for argument in arguments])
+        return status, *capfd.readouterr()
+
+    yield run
+    if before:
+        mi.set_variant(before)
+
+
+@pytest.fixture
+def write_scene(tmp_path):
+    """Write a scene and return its path."""
+
+    def write(integrator=command_line.PATH, extra="", text=command_line.SCENE):
+        path = tmp_path / "scene.xml"
+        path.write_text(text.replace("{integrator}", integrator).replace("{extra}", extra))
+        return path
+
+    return write

@@ -17,7 +17,7 @@ from aniso_pm.distributed import Options, render
 from aniso_pm.distributed.cluster import connected, local
 from aniso_pm.errors import Failed
 from aniso_pm.rendering.state import State
-from test_cli import OURS, SCENE, assert_same_picture, process
+from command_line import OURS, SCENE, assert_same_picture, process
 from test_distributed import alone
 from test_distributed import assert_same_picture as assert_same
 from test_distributed import scene as room

@@ -78,12 +78,12 @@ def test_wrong_usage_is_one_clear_line(capfd, arguments, part):
     [
         (["--workers", "2", "--scheduler", "tcp://x"], ["--workers and --scheduler", "one of"]),
         (["--tls-key", "k.pem"], ["--tls-", "only with --scheduler"]),
-        (["--mixed"], ["--mixed", "only with"]),
+        (["--mixed", "--task-seconds", "2"], ["--mixed, --task-seconds", "only with", "--workers"]),
         (["--scheduler-file", "no.json", "--passes", "2"], ["no.json", "no such file"]),
     ],
 )
 def test_options_of_workers_that_contradict_each_other(tmp_path, capfd, options, parts):
-    from test_cli import OURS, SCENE
+    from command_line import OURS, SCENE
 
     scene = tmp_path / "scene.xml"
     scene.write_text(SCENE.replace("{integrator}", OURS).replace("{extra}", ""))

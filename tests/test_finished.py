@@ -14,9 +14,9 @@ from aniso_pm.errors import InputError
 from aniso_pm.pictures import denoising, display
 from aniso_pm.rendering.allotment import Allotment
 from aniso_pm.rendering.film import pixel_weights, splat
+from command_line import OURS, PATH, SCENE, assert_one_line
 from PIL import Image
 from rooms import room
-from test_cli import OURS, PATH, SCENE, assert_one_line, run  # noqa: F401 (fixture)
 
 pytestmark = pytest.mark.usefixtures("without_pilot")
 
@@ -198,7 +198,7 @@ def channels(path):
         return pixels, dict(file.header())
 
 
-def test_layers_and_denoised_picture_are_written_and_merged(run, tmp_path):  # noqa: F811
+def test_layers_and_denoised_picture_are_written_and_merged(run, tmp_path):
     """As Nuke, Blender and tev name them; the rendered picture stays as it is."""
     scene = scene_file(tmp_path)
     common = ["render", scene, "--passes", "8", "--spp", "8"]
@@ -243,6 +243,8 @@ def test_layers_and_denoised_picture_are_written_and_merged(run, tmp_path):  # n
 @pytest.mark.parametrize(
     "options, parts",
     [
+        (["--layers", "albedo", "-p", "layers=normal"], ["--layers", "-p layers", "one of them"]),
+        (["--save-every", "9", "--integrator", "path"], ["--save-every", "one pass only"]),
         (["--layers", "albedo,nothing"], ['no layer "nothing"', "albedo"]),
         (["--bits", "12", "--png"], ["--bits is 12", "8 or 16"]),
         (["--exposure", "1"], ["add --png"]),
@@ -255,17 +257,17 @@ def test_layers_and_denoised_picture_are_written_and_merged(run, tmp_path):  # n
         (["--integrator", "path", "--layers", "albedo"], ["--layers", "aniso_pm does"]),
     ],
 )
-def test_wrong_options_are_one_clear_line(run, tmp_path, options, parts):  # noqa: F811
+def test_wrong_options_are_one_clear_line(run, tmp_path, options, parts):
     assert_one_line(run("render", scene_file(tmp_path), "-o", "a.exr", *options), *parts)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.xml"]
 
 
-def test_parameters_of_another_integrator_need_its_name(run, tmp_path):  # noqa: F811
+def test_parameters_of_another_integrator_need_its_name(run, tmp_path):
     result = run("render", scene_file(tmp_path, PATH), "-o", "a.exr", "-p", "max_depth=2")
     assert_one_line(result, "the scene's integrator is PathIntegrator", "--integrator")
 
 
-def test_the_integrator_and_its_parameters_are_replaced(run, tmp_path):  # noqa: F811
+def test_the_integrator_and_its_parameters_are_replaced(run, tmp_path):
     scene = scene_file(tmp_path, PATH)
     common = ["--json", "--quiet", "--spp", "2", "-o", "a.exr"]
     ours = ["--integrator", "aniso_pm", "-p", "map=global", "-p", "guard=false"]
@@ -280,7 +282,7 @@ def test_the_integrator_and_its_parameters_are_replaced(run, tmp_path):  # noqa:
     assert (status, found["alpha"], found["passes"], found["photon_count"]) == (0, 0.5, 0, 20000)
 
 
-def test_a_warning_is_printed_once(run, tmp_path, monkeypatch):  # noqa: F811
+def test_a_warning_is_printed_once(run, tmp_path, monkeypatch):
     real = mi.load_file
 
     def noisy_load(*args, **kwargs):
@@ -300,7 +302,7 @@ def test_a_warning_is_printed_once(run, tmp_path, monkeypatch):  # noqa: F811
 
 
 @pytest.mark.slow
-def test_what_blender_exports_renders_untouched(run, tmp_path):  # noqa: F811
+def test_what_blender_exports_renders_untouched(run, tmp_path):
     """The light of `path` by another integrator, with the file as it is but for its assets."""
     tests = Path(__file__).resolve().parent
     given = [tests / "blender_export.xml", "-D", f"assets={tests.parent / 'scenes'}", "--quiet"]

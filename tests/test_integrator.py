@@ -25,6 +25,12 @@ def test_sensor_may_be_an_index_or_an_object_and_seed_an_int_or_an_array(scene):
     np.testing.assert_allclose(first, second, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("sensor", [1, -1])
+def test_a_sensor_that_is_not_there_is_named(scene, sensor):
+    with pytest.raises(IndexError, match=f"sensor {sensor}: the scene has 1, counted from 0"):
+        integrator().render(scene, sensor=sensor, spp=1)
+
+
 def test_the_seed_decides(scene):
     plugin = integrator()
     images = [array(mi.render(scene, integrator=plugin, spp=4, seed=s)) for s in (1, 1, 2)]

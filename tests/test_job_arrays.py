@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from aniso_pm.rendering.state import State, missing
-from test_cli import OURS, SCENE, assert_same_picture, channels
+from command_line import OURS, SCENE, assert_same_picture, channels
 
 SCRIPTS = Path(__file__).resolve().parent.parent / "docs" / "clusters"
 

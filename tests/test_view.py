@@ -21,9 +21,9 @@ from aniso_pm.view import server
 from aniso_pm.view.session import Session
 from aniso_pm.view.snapshot import Snapshot
 from aniso_pm.view.watched import Watched
+from command_line import OURS, PATH, SCENE, assert_one_line
 from PIL import Image
 from rooms import room
-from test_cli import OURS, PATH, SCENE, assert_one_line, run  # noqa: F401 (fixture)
 
 pytestmark = pytest.mark.usefixtures("without_pilot")
 
@@ -232,7 +232,7 @@ def test_what_runs_elsewhere_cannot_be_steered(client):
 # --- The program ---
 
 
-def test_wrong_usage_is_one_clear_line(run, tmp_path, monkeypatch):  # noqa: F811
+def test_wrong_usage_is_one_clear_line(run, tmp_path, monkeypatch):
     scene = tmp_path / "scene.xml"
     scene.write_text(SCENE.format(integrator=PATH, extra=""))
     assert_one_line(run("view", scene), "PathIntegrator", "add --integrator aniso_pm")

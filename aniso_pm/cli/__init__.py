@@ -13,11 +13,11 @@ from typing import Annotated
 
 import typer
 from aniso_pm._version import __version__
-from aniso_pm.errors import Failed, InputError, is_interrupt, one_line
+from aniso_pm.errors import Failed, InputError, one_line
 from aniso_pm.pictures import output
 
 from . import bench, cluster, examine, explain, reference, render, report, scenes, view
-from .common import INTERRUPTED, InterruptError
+from .common import INTERRUPTED, InterruptError, interruptible
 
 app = typer.Typer(
     add_completion=True,
@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     except BaseException as error:
         if hasattr(error, "format_message"):  # typer's own: wrong usage
             return _fail(2, f"{error.format_message()} (see aniso-pm --help)", error)
-        if isinstance(error, InterruptError | typer.Abort) or is_interrupt(error):
+        if isinstance(error, InterruptError | typer.Abort | KeyboardInterrupt):
             return _fail(INTERRUPTED, "interrupted, nothing written", error)
         if isinstance(error, SystemExit):
             raise
@@ -92,4 +92,4 @@ for command in (
     bench.bench,
     cluster.cluster,
 ):
-    app.command()(command)
+    app.command()(interruptible(command))

@@ -6,8 +6,9 @@ import difflib
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -57,6 +58,21 @@ class InterruptError(Exception):
     """Ctrl-C before there was a picture (typer would end silently on KeyboardInterrupt itself)."""
 
 
+def interruptible(command: Callable[..., int]) -> Callable[..., int]:
+    """``command``, where Ctrl-C, however Mitsuba and Dr.Jit wrapped it, is an InterruptError."""
+
+    @wraps(command)
+    def run(*args: Any, **options: Any) -> int:
+        try:
+            return command(*args, **options)
+        except BaseException as error:
+            if is_interrupt(error):
+                raise InterruptError from error
+            raise
+
+    return run
+
+
 def make_directory(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -75,9 +91,16 @@ def parse_defines(pairs: list[str], option: str = "-D takes KEY=VALUE") -> dict[
     return defines
 
 
-def parse_parameters(pairs: list[str] | None) -> dict[str, Any]:
-    """Parameters of an integrator, NAME=VALUE: numbers, true or false, text."""
+def parse_parameters(pairs: list[str] | None, **options: Any) -> dict[str, Any]:
+    """Parameters of an integrator, NAME=VALUE: numbers, true or false, text.
+
+    options  of the command, None where not given, that set the parameter of their name: given both
+             ways is an InputError.
+    """
     texts = parse_defines(pairs or [], "-p takes NAME=VALUE")
+    for name in (name for name, value in options.items() if value is not None and name in texts):
+        option = f"--{name.replace('_', '-')}"
+        raise InputError(f"{option} and -p {name}={texts[name]}: give one of them")
     return {name: _value(text) for name, text in texts.items()}
 
 
@@ -134,7 +157,7 @@ def load(
         world = mi.load_file(str(scene), optimize=False, **defines)
     except BaseException as error:
         if is_interrupt(error):
-            raise InterruptError from error
+            raise
         reason = one_line(error)
         raise InputError(reason if scene.name in reason else f"{scene}: {reason}") from error
 

@@ -16,7 +16,6 @@ from aniso_pm.rendering.progress import shown
 from .common import (
     INTERRUPTED,
     Define,
-    InterruptError,
     SceneFile,
     Variant,
     load,
@@ -94,10 +93,8 @@ def reference(
                         references.write(path, made, compact)
                         saved = time.perf_counter()
             except BaseException as error:
-                if not is_interrupt(error):
+                if not is_interrupt(error) or made is None:
                     raise
-                if made is None:
-                    raise InterruptError from error
                 interrupted = True
         assert made is not None  # grow() has yielded, or raised
         made.record.update(scene=scene.name, defines=defines)

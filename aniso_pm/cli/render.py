@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from aniso_pm.errors import InputError, is_interrupt, one_line
+from aniso_pm.errors import InputError, one_line
 from aniso_pm.pictures import output
 from aniso_pm.rendering.progress import bar
 
@@ -19,7 +19,6 @@ from .common import (
     Camera,
     Define,
     Integrator,
-    InterruptError,
     Layers,
     Parameter,
     Passes,
@@ -49,6 +48,8 @@ from .workers import (
     rendering_elsewhere,
 )
 
+_SAVE_EVERY = 30.0  # seconds
+
 
 def render(
     scene: SceneFile,
@@ -70,14 +71,15 @@ def render(
         bool, typer.Option("--keep-state", help="Keep the state of a finished picture, to merge.")
     ] = False,
     save_every: Annotated[
-        float, typer.Option(min=0, help="Seconds between savings of picture and state.")
-    ] = 30.0,
+        float | None,
+        typer.Option(min=0, help="Seconds between savings of picture and state.  [default: 30]"),
+    ] = None,
     sensor: Camera = 0,
     workers: Workers = None,
     scheduler: Scheduler = None,
     scheduler_file: SchedulerFile = None,
     mixed: Mixed = False,
-    task_seconds: TaskSeconds = 5.0,
+    task_seconds: TaskSeconds = None,
     task_limit: TaskLimit = None,
     tls_ca_file: TlsCa = None,
     tls_cert: TlsCert = None,
@@ -115,7 +117,9 @@ def render(
     picture as it was rendered and adds a layer, denoised; it asks for the layers of denoising.
     """
     # --- Find out what would fail, before anything slow ---
-    defines, parameters = parse_defines(define or []), parse_parameters(parameter)
+    defines = parse_defines(define or [])
+    rules = {"passes": passes, "time": seconds, "target_error": target_error}
+    parameters = parse_parameters(parameter, layers=layer_names, **rules)
     pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
     if not scene.is_file():
         raise InputError(f"{scene}: there is no such file")
@@ -132,9 +136,9 @@ def render(
         started = time.perf_counter()
         world, camera, integrator = load(scene, defines, sensor, integrator_name, parameters)
         loaded = time.perf_counter()
-        rules = {"passes": passes, "time": seconds, "target_error": target_error}
         rules = {name: value for name, value in rules.items() if value is not None}
-        kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state)
+        kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state, save_every)
+        save_every = _SAVE_EVERY if save_every is None else save_every
         if kept is not None:
             output.check_writable(state_file)
         _ask_for_layers(integrator, layer_names, denoise)
@@ -284,7 +288,11 @@ def merge(
 
 
 def _prepare_passes(
-    integrator, rules: dict[str, Any], first_pass: int, keep_state: bool
+    integrator,
+    rules: dict[str, Any],
+    first_pass: int,
+    keep_state: bool,
+    save_every: float | None,
 ) -> bool | None:
     """Set the options that concern passes; an InputError where the integrator has none.
 
@@ -295,6 +303,7 @@ def _prepare_passes(
         options = [f"--{name.replace('_', '-')}" for name in rules]
         options += ["--first-pass"] if first_pass else []
         options += ["--resume or --keep-state"] if keep_state else []
+        options += ["--save-every"] if save_every is not None else []
         if options:
             kind = integrator.class_name()
             raise InputError(f"{', '.join(options)}: {kind} renders in one pass only")
@@ -333,10 +342,6 @@ def _render(world, camera, integrator, seed: int, spp: int | None, quiet: bool) 
     except ValueError as error:
         # Something the integrator cannot do with this scene or these parameters
         raise InputError(one_line(error)) from error
-    except BaseException as error:
-        if is_interrupt(error):
-            raise InterruptError from error
-        raise
 
 
 def _done(record: dict[str, Any], out: Path, picture: Path | None) -> str:

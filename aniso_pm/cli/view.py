@@ -88,28 +88,24 @@ def view(
             pictures = Pictures.checked(
                 out or Path(scene.with_suffix(".exr").name), False, 0, "srgb", 8, False
             )
+            defines = parse_defines(define or [])
+            rules = {"passes": passes, "time": seconds, "target_error": target_error}
+            parameters = parse_parameters(parameter, layers=layer_names, **rules)
             set_variant(variant)
-            world, camera, integrator = load(
-                scene,
-                parse_defines(define or []),
-                sensor,
-                integrator_name,
-                parse_parameters(parameter),
-            )
+            world, camera, integrator = load(scene, defines, sensor, integrator_name, parameters)
             if not hasattr(integrator, "stop_after"):
                 raise InputError(
                     f"{scene}: the integrator is {integrator.class_name()}, which cannot be "
                     "watched; add --integrator aniso_pm"
                 )
             try:
-                rules = {"passes": passes, "time": seconds, "target_error": target_error}
                 given = {name: value for name, value in rules.items() if value is not None}
                 integrator.stop_after(**(given or {"time": _ENDLESS}))
                 if layer_names is not None:
                     integrator.settings = integrator.settings.with_(layers=layer_names)
             except ValueError as error:
                 raise InputError(one_line(error)) from error
-            made_by = {"scene": scene.name, "variant": variant, "seed": seed, "defines": define}
+            made_by = {"scene": scene.name, "variant": variant, "seed": seed, "defines": defines}
 
             def save() -> list[Path]:
                 record = record_of(integrator, camera) | made_by

@@ -26,7 +26,10 @@ Mixed = Annotated[
     bool, typer.Option("--mixed", help="Let LLVM and CUDA workers render one picture.")
 ]
 TaskSeconds = Annotated[
-    float, typer.Option("--task-seconds", min=0.01, help="Seconds that a worker's task takes.")
+    float | None,
+    typer.Option(
+        "--task-seconds", min=0.01, help="Seconds that a worker's task takes.  [default: 5]"
+    ),
 ]
 TaskLimit = Annotated[
     float | None,
@@ -51,25 +54,27 @@ def rendering_elsewhere(
     scheduler: str | None,
     scheduler_file: Path | None,
     tls: dict[str, Path | None],
-    **options,
+    *,
+    mixed: bool,
+    task_seconds: float | None,
+    task_limit: float | None,
+    home_every: float,
 ) -> Iterator[None]:
     """Let ``integrator`` render on workers inside the block, if they are asked for.
 
-    options: of ``distributed.Options``.
+    mixed, task_seconds, task_limit, home_every: of ``distributed.Options``.
     """
     ways = {"--workers": workers, "--scheduler": scheduler, "--scheduler-file": scheduler_file}
     asked = [name for name, value in ways.items() if value]
     tls_given = {f"tls_{name}": str(path) for name, path in tls.items() if path}
     if len(asked) > 1:
         raise InputError(f"{' and '.join(asked)}: give one of them")
-    if not scheduler and not scheduler_file:
-        others = [name for name, given in (("--tls-…", tls_given),) if given]
-        if not workers:
-            others += ["--mixed"] * bool(options["mixed"])
-            others += ["--task-limit"] * bool(options["task_limit"])
-        if others:
-            raise InputError(f"{', '.join(others)}: only with --scheduler or --scheduler-file")
+    if tls_given and not scheduler and not scheduler_file:
+        raise InputError("--tls-…: only with --scheduler or --scheduler-file")
     if not asked:
+        others = {"--mixed": mixed, "--task-seconds": task_seconds, "--task-limit": task_limit}
+        if given := [name for name, value in others.items() if value]:
+            raise InputError(f"{', '.join(given)}: only with one of {', '.join(ways)}")
         yield
         return
     if not hasattr(integrator, "elsewhere"):
@@ -89,7 +94,14 @@ def rendering_elsewhere(
         place = connected(scheduler, scheduler_file, tls_given)
     with place as client:
         patience = _LOCAL_PATIENCE if workers else Options.patience
-        chosen = Options(keep=workers or 0, patience=patience, **options)
+        chosen = Options(
+            task_seconds=task_seconds or Options.task_seconds,
+            task_limit=task_limit,
+            patience=patience,
+            keep=workers or 0,
+            home_every=home_every,
+            mixed=mixed,
+        )
         integrator.elsewhere = Elsewhere(client, parcel, sensor, chosen, warn)
         try:
             yield
