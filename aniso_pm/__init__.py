@@ -1,8 +1,9 @@
 """Photon mapping with anisotropic density estimation, as plugins of Mitsuba 3.
 
-Importing this package registers the integrator ``aniso_pm`` and the BSDF ``asgconductor`` for
-the current Mitsuba variant and every later one. Import it before ``drjit`` and ``mitsuba``: it
-then also provides an LLVM that Dr.Jit can use (see :mod:`aniso_pm._llvm`).
+Importing this package registers the integrator ``aniso_pm``, the BSDF ``asgconductor`` and the
+sampler ``owen_sobol`` for the current Mitsuba variant and every later one. Import it before
+``drjit`` and ``mitsuba``: it then also provides an LLVM that Dr.Jit can use (see
+:mod:`aniso_pm._llvm`).
 
 The mathematics is usable by itself: :mod:`aniso_pm.asg` (anisotropic spherical Gaussians),
 :mod:`aniso_pm.ndf` (roughness to ASG), :mod:`aniso_pm.warp` (half-vector to reflection) and

@@ -43,8 +43,8 @@ class ASGConductor:
 
      * - alpha, alpha_u, alpha_v
        - |float| or |texture|
-       - Roughness, along the tangent and the bitangent; between 0.0001 and 1, values outside are
-         clamped. (Default: 0.1)
+       - Roughness, along the tangent and the bitangent; above 0 and at most 1. Values below 0.0001,
+         and those of a texture outside of both, are clamped. (Default: 0.1)
 
      * - specular_reflectance
        - |spectrum| or |texture|

@@ -73,8 +73,9 @@ class AnisoPhotonMapper:
          ``caustic``: the map holds only light that reached a receiver over glass, mirrors and
          glossy surfaces; the rest is path traced, and scenes without caustics have no map.
          ``auto``: a pilot finds out which of the two, or path tracing without any photon, has
-         the least error for the time in this scene; path tracing only if it finds all of the light
-         that the photons bring, and neither ``photon_count`` nor ``initial_radius`` is given.
+         the least error for the time in this scene; path tracing only if the pilot's eye paths
+         have met most of the light of the caustics, no light is a point or a direction, and
+         neither ``photon_count`` nor ``initial_radius`` is given.
          Scenes without surfaces that light is traced over (glass, mirrors, smooth or coated metal)
          are path traced, those with lights that only photons find take ``global``.
          ``statistics["map"]`` tells which it was, or "none", and ``statistics["map_errors"]`` the
@@ -103,8 +104,9 @@ class AnisoPhotonMapper:
        - Number of passes with fresh photons and fresh eye paths; the samples per pixel are the
          total over all passes, shared evenly. 0 is without limit: passes go on until ``time`` or
          ``target_error`` ends them, and each takes the samples per pixel that are given, but no
-         more than make 524,288 eye samples in all, fewer where it has many light paths (and at
-         least one a pixel).
+         more than make 524,288 eye samples in all (in large pictures up to four a pixel, while
+         these are no more than 2,097,152), fewer where it has many light paths, and at least one
+         a pixel.
          (Default: 1, or 0 where ``time`` or ``target_error`` is given)
 
      * - time

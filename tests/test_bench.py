@@ -1,6 +1,7 @@
 """The benchmark: its rivals count the same photons, its verdicts follow from its figures."""
 
 import json
+import sys
 
 import drjit as dr
 import mitsuba as mi
@@ -152,9 +153,19 @@ def test_bench_prints_json(capsys):
     assert rows[0]["target"] == "<= 0" and rows[0]["met"] is True
 
 
+def test_what_is_not_installed_is_a_row_with_a_note(capsys, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("aniso_pm.instruments.report")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "aniso_pm.instruments.bench.errors", raising=False)
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    assert cli.main(["bench", "error", "--quick", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["figure"] is None and "pip install 'aniso-pm[report]'" in row["note"]
+
+
 @pytest.mark.slow
 def test_the_whole_benchmark_runs_quickly(capsys):
-    assert cli.main(["bench", "--quick", "--json"]) == 0
+    assert cli.main(["bench", "all", "--quick", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert {row["name"].split(":")[0] for row in rows} == set(GROUPS)
     # Large pictures are too slow for that, and say so.

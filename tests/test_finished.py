@@ -245,6 +245,7 @@ def test_layers_and_denoised_picture_are_written_and_merged(run, tmp_path):
     [
         (["--layers", "albedo", "-p", "layers=normal"], ["--layers", "-p layers", "one of them"]),
         (["--save-every", "9", "--integrator", "path"], ["--save-every", "one pass only"]),
+        (["--save-every", "9"], ["--save-every", "a single pass", "--passes"]),
         (["--layers", "albedo,nothing"], ['no layer "nothing"', "albedo"]),
         (["--bits", "12", "--png"], ["--bits is 12", "8 or 16"]),
         (["--exposure", "1"], ["add --png"]),
@@ -260,6 +261,19 @@ def test_layers_and_denoised_picture_are_written_and_merged(run, tmp_path):
 def test_wrong_options_are_one_clear_line(run, tmp_path, options, parts):
     assert_one_line(run("render", scene_file(tmp_path), "-o", "a.exr", *options), *parts)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.xml"]
+
+
+@pytest.mark.parametrize("option", ["--png", "--denoise"])
+def test_bands_that_are_no_colours_are_told_before_rendering(run, tmp_path, option):
+    band = '<spectrum name="band" value="400:1, 700:0"/>'
+    text = SCENE.replace('"hdrfilm">', f'"specfilm">{band}')
+    text = text.replace('<string name="pixel_format" value="rgba"/>', "")
+    (tmp_path / "scene.xml").write_text(text.format(integrator=PATH, extra=""))
+    variant = ["-m", "llvm_ad_spectral"]
+    result = run("render", "scene.xml", "-o", "a.exr", *variant, option)
+    assert_one_line(result, f"{option}: the pixels of a SpecFilm are no colours")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.xml"]
+    assert run("render", "scene.xml", "-o", "a.exr", *variant)[0] == 0
 
 
 def test_parameters_of_another_integrator_need_its_name(run, tmp_path):

@@ -371,7 +371,7 @@ def test_wrong_input_is_said_in_one_line_before_anything_runs(
 def test_a_missing_package_is_named_with_its_remedy(scene, tmp_path, monkeypatch, capfd):
     monkeypatch.setitem(sys.modules, "scipy", None)
     assert cli.main(["report", str(scene), "-o", str(tmp_path)]) == 2
-    assert "pip install jinja2 matplotlib scipy" in capfd.readouterr().err
+    assert "pip install 'aniso-pm[report]'" in capfd.readouterr().err
 
 
 def test_a_missing_denoiser_is_named_before_anything_runs(scene, tmp_path, monkeypatch, capfd):

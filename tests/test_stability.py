@@ -220,7 +220,7 @@ def test_the_command_writes_json_page_and_markdown(few_cases, tmp_path, capsys):
 def test_the_command_says_what_is_missing(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "mpmath", None)
     assert cli.main(["stability", "-o", str(tmp_path)]) == 2
-    assert "pip install jinja2 mpmath" in capsys.readouterr().err
+    assert "pip install 'aniso-pm[stability]'" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -240,6 +240,8 @@ def test_wrong_usage_is_one_clear_line(run, tmp_path, monkeypatch):
     assert_one_line(run("view", "none.xml"), "none.xml: there is no such file")
     (tmp_path / "a.state").write_text("nothing")
     assert_one_line(run("view", "a.state"), "a.state: not a whole state file")
+    options = ["--spp", "4", "-p", "map=global"]
+    assert_one_line(run("view", "a.state", *options), "--spp, -p: a state", "rendered elsewhere")
     real = builtins.__import__
 
     def without_flask(name, *rest, **kwargs):

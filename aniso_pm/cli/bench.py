@@ -16,12 +16,12 @@ def bench(
         list[str] | None,
         typer.Argument(
             metavar="[gather|trace|build|pass|memory|startup|kernels|error|large|denoise|all]...",
-            help="What to measure; everything by default.",
+            help="What to measure; by default all but error, large and denoise, which take long.",
         ),
     ] = None,
     variant: Variant = "llvm_ad_rgb",
     quick: Annotated[
-        bool, typer.Option("--quick", help="Smaller sizes, nothing slow; less than a minute.")
+        bool, typer.Option("--quick", help="Smaller sizes, fewer repetitions; less than a minute.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON list.")] = False,
 ) -> int:
@@ -32,9 +32,9 @@ def bench(
     (such as ">= 0.85"; null where the line informs only), met (true, false or null) and note.
     Exit status 0 also where a target is missed.
     """
-    from aniso_pm.instruments.bench import GROUPS
+    from aniso_pm.instruments.bench import GROUPS, LONG
 
-    groups = groups or ["all"]
+    groups = groups or [group for group in GROUPS if group not in LONG]
     for group in groups:
         if group not in (*GROUPS, "all"):
             raise InputError(

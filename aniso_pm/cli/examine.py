@@ -70,7 +70,7 @@ def stability(
         import mpmath  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"this needs {error.name}, which is not installed: pip install jinja2 mpmath"
+            f"this needs {error.name}, which is not installed: pip install 'aniso-pm[stability]'"
         ) from error
     make_directory(out)
     set_variant(variant)

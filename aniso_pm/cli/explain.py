@@ -88,5 +88,5 @@ def _check_picture(out: Path) -> None:
         import matplotlib  # noqa: F401
     except ImportError as error:
         raise InputError(
-            "this needs matplotlib, which is not installed: pip install matplotlib"
+            "this needs matplotlib, which is not installed: pip install 'aniso-pm[report]'"
         ) from error

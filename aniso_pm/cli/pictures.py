@@ -69,6 +69,14 @@ class Pictures:
             denoising.check_installed()
         return Pictures(out, picture, exposure, tonemap, bits, denoise)
 
+    def check_film(self, film) -> None:
+        """Raises InputError for a film whose pixels are no colours, where colours are needed."""
+        import mitsuba as mi
+
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special) and (self.png or self.denoise):
+            option = "--png" if self.png else "--denoise"
+            raise InputError(f"{option}: the pixels of a {film.class_name()} are no colours")
+
     def write(
         self,
         film,
@@ -86,10 +94,9 @@ class Pictures:
         layers = dict(layers or {})
         colours = display.colours(film)
         if colours is None:
-            if self.denoise or self.png:
-                path = self.png or self.out
-                raise output.OutputError(f"cannot write '{path}': the film has no colour channels")
             output.write_exr(film, self.out, record, variance, layers)
+            if self.denoise or self.png:
+                raise output.OutputError(f"'{self.out}' is written, but its pixels are no colours")
             return
         if self.denoise:
             known = dict(layers)

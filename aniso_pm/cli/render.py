@@ -136,6 +136,7 @@ def render(
         started = time.perf_counter()
         world, camera, integrator = load(scene, defines, sensor, integrator_name, parameters)
         loaded = time.perf_counter()
+        pictures.check_film(camera.film())
         rules = {name: value for name, value in rules.items() if value is not None}
         kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state, save_every)
         save_every = _SAVE_EVERY if save_every is None else save_every
@@ -235,6 +236,8 @@ def merge(
     from aniso_pm.rendering.state import merge as merged
 
     pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
+    if first_pass and not passes:
+        raise InputError("--first-pass: only with --passes")
     try:
         loaded = [
             str(name.with_suffix(".state") if name.suffix.lower() == ".exr" else name)
@@ -314,7 +317,14 @@ def _prepare_passes(
         except ValueError as error:
             raise InputError(one_line(error)) from error
     integrator.first_pass = first_pass
-    return keep_state if keep_state or integrator.settings.passes != 1 else None
+    if keep_state or integrator.settings.passes != 1:
+        return keep_state
+    if save_every is not None:
+        raise InputError(
+            "--save-every: a single pass is saved at its end; give --passes, --time or "
+            "--target-error"
+        )
+    return None
 
 
 def _ask_for_layers(integrator, layers: str | None, denoise: bool) -> None:

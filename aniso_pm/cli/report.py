@@ -76,7 +76,7 @@ def report(
         import scipy  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"this needs {error.name}, which is not installed: pip install jinja2 matplotlib scipy"
+            f"this needs {error.name}, which is not installed: pip install 'aniso-pm[report]'"
         ) from error
     from aniso_pm.instruments.report import conclusions, make
     from aniso_pm.instruments.report.plan import Plan

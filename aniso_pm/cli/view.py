@@ -83,6 +83,17 @@ def view(
         raise server.missing() from error
     with mitsuba_log(quiet):
         if scene.suffix.lower() == ".state":
+            _check_not_given(
+                output=out,
+                define=define,
+                spp=spp,
+                passes=passes,
+                time=seconds,
+                target_error=target_error,
+                integrator=integrator_name,
+                p=parameter,
+                layers=layer_names,
+            )
             shown: Any = _watched(scene)
         else:
             pictures = Pictures.checked(
@@ -128,6 +139,14 @@ def view(
         finally:
             close()
     return 0
+
+
+def _check_not_given(**options: Any) -> None:
+    """An InputError for options that a rendering elsewhere cannot be given."""
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        names = (f"--{name.replace('_', '-')}" if len(name) > 1 else f"-{name}" for name in given)
+        raise InputError(f"{', '.join(names)}: a state that is watched is rendered elsewhere")
 
 
 def _watched(path: Path):

@@ -27,7 +27,7 @@ def require() -> None:
         import distributed  # noqa: F401
     except ImportError as error:
         raise InputError(
-            "rendering on workers needs dask.distributed: pip install 'aniso_pm[distributed]'"
+            "rendering on workers needs dask.distributed: pip install 'aniso-pm[distributed]'"
         ) from error
 
 

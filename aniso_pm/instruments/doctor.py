@@ -101,7 +101,7 @@ def _self_test(variant: str, llvm_is_wrong: bool) -> list[Check]:
     if llvm_is_wrong:
         error, fix = "does not start", "mend LLVM, above"
     else:
-        fix = "reinstall: pip install --force-reinstall aniso-pm"
+        fix = "reinstall, in your clone: pip install --force-reinstall ."
         if variant.startswith("cuda"):
             fix += " (in a container, OptiX needs NVIDIA_DRIVER_CAPABILITIES=all)"
 

@@ -13,6 +13,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from importlib import import_module
 
+from aniso_pm.errors import InputError
+
 from .row import Row
 
 # What `aniso-pm bench` calls each group: module and function.
@@ -28,14 +30,22 @@ GROUPS = {
     "large": ("errors", "measure_large"),
     "denoise": ("denoising", "measure"),
 }
+# Those that render the gallery, which takes a quarter of an hour and more each.
+LONG = ("error", "large", "denoise")
 
 
 def measure(groups: list[str], quick: bool) -> Iterator[Row]:
     """The rows of the named groups, as they are measured. A Mitsuba variant has to be set.
 
-    quick  smaller sizes, fewer repetitions, no slow row: less than a minute for everything, but
-           too small for some of the targets.
+    quick  smaller sizes, fewer repetitions, no slow row: less than a minute for all but ``LONG``,
+           but too small for some of the targets.
     """
     for group in groups:
         module, function = GROUPS[group]
-        yield from getattr(import_module(f"{__name__}.{module}"), function)(quick)
+        try:
+            yield from getattr(import_module(f"{__name__}.{module}"), function)(quick)
+        except InputError as error:
+            yield Row(group, None, "×", None, str(error))
+        except ModuleNotFoundError as error:
+            missing = f"{error.name} is not installed: pip install 'aniso-pm[report]'"
+            yield Row(group, None, "×", None, missing)

@@ -91,7 +91,7 @@ def _even(photons, queries, repetitions, speed) -> Iterator[Row]:
         note("rows"),
     )
     if tree is None:
-        missing = "scipy is not installed: pip install scipy"
+        missing = "scipy is not installed: pip install 'aniso-pm[report]'"
         yield Row("gather: aspect 1 against scipy's cKDTree", None, "×", (">=", 8.0), missing)
     else:
         yield Row(

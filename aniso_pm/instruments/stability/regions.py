@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from aniso_pm.map.density import PROBES_MAX
+
 
 @dataclass(frozen=True)
 class Region:
@@ -63,7 +65,7 @@ REGIONS = (
     ),
     Region(
         "off surface",
-        "12 probe rays find no part of a kernel on its surface",
+        f"{PROBES_MAX} probe rays find no part of a kernel on its surface",
         "no edge compensation for that estimate",
         "gather_points_off_surface",
     ),
