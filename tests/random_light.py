@@ -29,6 +29,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from aniso_pm.transport import emission
+from aniso_pm.transport.focus import Focus
 
 SUSPICION = 4.0
 # Colours weigh differently, so that swapped ones show.
@@ -339,16 +340,21 @@ def summary(values):
     )
 
 
-def from_light_paths(scene, sides, count, seed, wavelengths):
-    """Flux that light paths carry to the receivers that they meet first."""
+def from_light_paths(scene, sides, count, seed, wavelengths, focus=None):
+    """Flux that light paths carry to the receivers that they meet first. focus: where those from
+    outside begin."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, count)
-    ray, flux, _ = emission.prepare(scene).sample_ray(
-        mi.Float(0),
-        sampler.next_1d(),
-        sampler.next_2d(),
-        sampler.next_2d(),
-        wavelengths=wavelengths,
+    ray, flux, _ = (
+        emission.prepare(scene)
+        .focused(focus)
+        .sample_ray(
+            mi.Float(0),
+            sampler.next_1d(),
+            sampler.next_2d(),
+            sampler.next_2d(),
+            wavelengths=wavelengths,
+        )
     )
     si = scene.ray_intersect(ray)
     lands, is_shell = mi.Bool(False), mi.Bool(False)
@@ -439,9 +445,9 @@ def from_surface(scene, sides, count, seed, wavelengths):
 # --- Tries ---
 
 
-def difference(kind, scene, sides, count, seed, wavelengths):
+def difference(kind, scene, sides, count, seed, wavelengths, focus=None):
     """z-scores of the quantities; 0 where there is no light."""
-    found = from_light_paths(scene, sides, count, seed, wavelengths)
+    found = from_light_paths(scene, sides, count, seed, wavelengths, focus)
     scores, ratios = [], []
     others = [from_surface if kind.parallel else from_emitter_sampling]
     for number, estimate in enumerate(others + [from_rays] * kind.met):
@@ -478,7 +484,8 @@ class Try:
 
 
 def attempt(name, seed, count, move=False):
-    """One random scene of a kind; ``move``: reached from another one through ``mi.traverse``."""
+    """One random scene of a kind; ``move``: reached from another one through ``mi.traverse``. In
+    those that are not moved light from outside begins above the ball, mostly."""
     kind, rng = kinds()[name], np.random.default_rng([seed, *map(ord, name)])
     parts = scene(kind, rng)
     made = load(parts)
@@ -486,15 +493,18 @@ def attempt(name, seed, count, move=False):
         emission.prepare(made)  # Whatever is remembered of a scene is remembered wrong now
         parts = scene(kind, rng)
         become(made, load(parts))
-    sides = Sides.random(rng, np.array(parts["ball"]["to_world"].matrix)[:3, 3])
+    ball = np.array(parts["ball"]["to_world"].matrix)[:3, 3]
+    sides = Sides.random(rng, ball)
+    extent = np.linalg.norm(made.bbox().extents())
+    focus = Focus(tuple(map(float, ball)), 0.05 * extent) if kind.open and not move else None
     wavelengths = None
     if mi.is_spectral:
         wavelengths = mi.sample_rgb_spectrum(mi.sample_shifted(mi.Float(rng.uniform())))[0]
     number = int(rng.integers(1 << 30))
-    z, ratio = difference(kind, made, sides, count, number, wavelengths)
+    z, ratio = difference(kind, made, sides, count, number, wavelengths, focus)
     again = None
     if np.abs(z).max() > SUSPICION:
-        again, ratio = difference(kind, made, sides, 16 * count, number + 1, wavelengths)
+        again, ratio = difference(kind, made, sides, 16 * count, number + 1, wavelengths, focus)
     return Try(name, seed, move, z, again, ratio)
 
 

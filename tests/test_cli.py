@@ -12,7 +12,7 @@ import OpenEXR
 import pytest
 from aniso_pm import __version__, cli
 from aniso_pm.errors import one_line
-from aniso_pm.pictures.output import plain
+from aniso_pm.pictures.output import OutputError, plain
 from command_line import OURS, PATH, assert_one_line, process
 
 pytestmark = pytest.mark.usefixtures("without_pilot")
@@ -148,6 +148,17 @@ def test_ctrl_c_before_there_is_a_picture_is_told(run, write_scene, tmp_path, mo
     result = run("render", write_scene(OURS), "-o", "a.exr")
     assert result == (130, "", "aniso-pm: error: interrupted, nothing written\n")
     assert [path.name for path in tmp_path.iterdir()] == ["scene.xml"]
+
+
+def test_what_ctrl_c_cannot_save_is_told(run, write_scene, monkeypatch):
+    def load(*_):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            raise OutputError("cannot write 'a.exr': no space left")  # noqa: B904
+
+    monkeypatch.setattr("aniso_pm.cli.render.load", load)
+    assert_one_line(run("render", write_scene(OURS), "-o", "a.exr"), "no space left")
 
 
 def test_messages_lose_source_positions_and_line_breaks():

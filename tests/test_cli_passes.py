@@ -56,6 +56,9 @@ def test_kept_states_are_not_lost(run, write_scene, tmp_path):
     before = (tmp_path / "a.state").read_bytes()
     for options in (["--passes", 2], ["--passes", 2, "--keep-state"], ["--spp", 1]):
         assert_one_line(run("render", path, "-o", "a.exr", *options), "a.state", "--resume")
+    other = run("render", path, "-o", "a.exr", "--integrator", "path")
+    assert_one_line(other, "a.state", "delete the file")
+    assert "--resume" not in other[2]
     for out in ("a.exr", tmp_path / "a.exr"):
         assert_one_line(run("merge", "a.exr", "-o", out), "take the place of", "a.state")
     assert (tmp_path / "a.state").read_bytes() == before

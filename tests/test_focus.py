@@ -45,7 +45,18 @@ def test_light_above_what_is_seen_has_the_smallest_weight():
     assert made.weight < 1e-3 and weight[2] > 0.1
 
 
-def test_what_most_rays_hit_is_found():
+@pytest.mark.parametrize("radius", [0.01, 1e-4, 1e-6])
+def test_its_weight_is_even_however_numbers_are_rounded(radius):
+    made, count = discs(radius), 1 << 16
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, count)
+    u = sampler.next_2d()
+    u.x *= 0.5  # the first disc
+    _, weight = made.sample(u, mi.Vector3f(0, 0, 1))
+    np.testing.assert_allclose(weight.numpy(), made.weight, rtol=1e-4)
+
+
+def test_what_most_paths_read_is_found():
     random = np.random.default_rng(0)
     near = random.normal((5, 1, 0), 1, (900, 3))
     far = random.normal(0, 300, (100, 3))
@@ -57,7 +68,7 @@ def test_what_most_rays_hit_is_found():
 # --- In renderings ---
 
 
-def plain(light, ball, extent=500.0):
+def plain(light, ball, extent=500.0, **more):
     """Two balls on a wide plain."""
     T = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
@@ -72,6 +83,7 @@ def plain(light, ball, extent=500.0):
             "ball": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7, "bsdf": ball},
             "other": {"type": "sphere", "center": [1.2, 0.5, 1], "radius": 0.5},
         }
+        | more
     )
 
 
@@ -111,6 +123,20 @@ def test_only_light_from_outside_is_begun_elsewhere(light, looked_for):
     focus = integrator.statistics["focus"]
     assert bool(focus) == looked_for and (not focus or focus["radius"] < 20)
     assert not looked_for or integrator.statistics["photons_stored"] > 100
+
+
+def test_light_is_begun_above_what_is_seen_through_a_window():
+    T = mi.ScalarTransform4f
+    pane = T().look_at(origin=[0, 1.95, 5.8], target=[0, 2, 6], up=[0, 1, 0]).scale(0.3)
+    window = {"type": "rectangle", "to_world": pane, "bsdf": {"type": "thindielectric"}}
+    found = []
+    for more in ({}, {"window": window}):
+        integrator = mi.load_dict({"type": "aniso_pm", "map": "global", "photon_count": 100_000})
+        scene = plain({"type": "constant"}, {"type": "diffuse"}, **more)
+        mi.render(scene, integrator=integrator, spp=1)
+        found.append(integrator.statistics["focus"]["radius"])
+    print(found)
+    assert found[1] == pytest.approx(found[0], rel=0.2)
 
 
 def test_a_map_without_photons_is_told(capfd):

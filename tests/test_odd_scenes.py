@@ -140,21 +140,57 @@ def test_an_irradiance_meter_is_a_sensor_like_others(rgb):
     assert ours == pytest.approx(path, rel=0.1)
 
 
-def checkered_lamp():
+def chequers():
     """Mitsuba draws no points by this texture."""
-    definition = room({"bulb": {"type": "point", "intensity": 0.1}}, size=8)
     tiles = mi.ScalarTransform4f().scale([3, 3, 1])
-    texture = {"type": "checkerboard", "color0": 0.0, "color1": 20.0, "to_uv": tiles}
-    definition["light"]["emitter"] = {"type": "area", "radiance": texture}
+    return {"type": "checkerboard", "color0": 0.0, "color1": 20.0, "to_uv": tiles}
+
+
+def checkered_lamp(**shape):
+    definition = room({"bulb": {"type": "point", "intensity": 0.1}}, size=8)
+    if shape:
+        definition["light"] = shape
+    definition["light"]["emitter"] = {"type": "area", "radiance": chequers()}
     return mi.load_dict(definition)
 
 
-def test_a_lamp_with_any_texture_shines(rgb):
-    scene, path = checkered_lamp(), mi.load_dict({"type": "path"})
+@pytest.mark.parametrize("angle", [None, 45, 90])
+def test_a_lamp_with_any_texture_shines(rgb, angle):
+    """A rectangle, and spheres that are turned."""
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], angle or 0).scale(0.3)
+    scene = checkered_lamp(**({"type": "sphere", "to_world": turned} if angle else {}))
+    path = mi.load_dict({"type": "path"})
     ours = [mi.render(scene, integrator=integrator(), spp=256, seed=k) for k in range(4)]
     ratios = np.mean(ours, axis=(1, 2, 3)) / np.mean(mi.render(scene, integrator=path, spp=16_384))
     print(ratios)
     assert abs(ratios.mean() - 1) < 0.005 + 3 * ratios.std(ddof=1) / 2
+
+
+@pytest.mark.parametrize(
+    "emitter",
+    [
+        {"type": "area", "radiance": {"type": "checkerboard"}},
+        {"type": "spot", "texture": {"type": "checkerboard"}},
+    ],
+    ids=lambda emitter: emitter["type"],
+)
+def test_scenes_that_are_alive_beside_it_do_not_matter(rgb, emitter):
+    """Dr.Jit traces the calls of their emitters, too."""
+    other = {"type": "scene", "a": emitter}
+    if emitter["type"] == "area":
+        other = {"type": "scene", "a": {"type": "rectangle", "emitter": emitter}}
+    other = mi.load_dict(other)
+    scene = mi.load_dict(room({"bulb": {"type": "point", "intensity": 0.1}}, size=8))
+    assert array(mi.render(scene, integrator=integrator(), spp=1)).min() > 0
+    assert len(other.emitters()) == 1
+
+
+@pytest.mark.parametrize("kind, name", [("spot", "texture"), ("projector", "irradiance")])
+def test_lamps_without_surface_need_a_texture_that_can_be_drawn_from(rgb, kind, name):
+    definition = room(size=8)
+    definition["light"] = {"type": kind, "id": "lamp", name: {"type": "checkerboard"}}
+    with pytest.raises(ValueError, match='"lamp" has a texture from which.*use a bitmap$'):
+        integrator().render(mi.load_dict(definition), spp=1)
 
 
 def test_a_texture_that_cannot_be_drawn_from_is_named_in_spectral_variants(

@@ -59,14 +59,15 @@ class InterruptError(Exception):
 
 
 def interruptible(command: Callable[..., int]) -> Callable[..., int]:
-    """``command``, where Ctrl-C, however Mitsuba and Dr.Jit wrapped it, is an InterruptError."""
+    """``command``, where Ctrl-C, however Mitsuba and Dr.Jit wrapped it, is an InterruptError,
+    unless what it made impossible is told instead."""
 
     @wraps(command)
     def run(*args: Any, **options: Any) -> int:
         try:
             return command(*args, **options)
         except BaseException as error:
-            if is_interrupt(error):
+            if is_interrupt(error) and not isinstance(error, output.OutputError):
                 raise InterruptError from error
             raise
 

@@ -124,11 +124,6 @@ def render(
     if not scene.is_file():
         raise InputError(f"{scene}: there is no such file")
     state_file = out.with_suffix(".state")
-    if state_file.exists() and not resume:
-        raise InputError(
-            f"{state_file}: passes of an earlier rendering are there; --resume goes on with them, "
-            "or delete the file to start afresh"
-        )
 
     set_variant(variant)
     with mitsuba_log(quiet):
@@ -139,6 +134,12 @@ def render(
         pictures.check_film(camera.film())
         rules = {name: value for name, value in rules.items() if value is not None}
         kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state, save_every)
+        if state_file.exists() and not resume:
+            go_on = "--resume goes on with them, or " * hasattr(integrator, "stop_after")
+            raise InputError(
+                f"{state_file}: passes of an earlier rendering are there; {go_on}"
+                "delete the file to start afresh"
+            )
         save_every = _SAVE_EVERY if save_every is None else save_every
         if kept is not None:
             output.check_writable(state_file)

@@ -294,7 +294,7 @@ def probe_surface(
         if cover is not None:
             gathers, clear = cover(si.bsdf(), probing & si.is_valid())
             passes |= clear
-            on_surface &= gathers | passes
+            on_surface &= gathers | clear
         landed |= probing & on_surface
         depth += si.t + 1e-3 * height + rounding
         fresh = ~(si.is_valid() & passes) | (depth >= 2 * height)

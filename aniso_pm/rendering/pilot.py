@@ -129,17 +129,26 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
         widths=found.widths,
         aim=found.aim,
         lobes=round(found.lobes, 2),
-        focus=focus,
+        focus=focus if found.use != "none" else None,
     )
 
 
 def _focus(scene: Prepared, sensor, seed: int) -> Focus | None:
-    """The part of the scene that light from outside is to meet."""
+    """The part of the scene that light from outside is to meet: where eye paths gather, be it
+    behind glass or in a mirror."""
     if not (scene.needs_map and scene.emission and scene.emission.from_outside):
         return None
-    si = scene.scene.ray_intersect(camera_rays(sensor, seed), mi.RayFlags.Minimal, True)
-    points = np.array(si.p).T[si.is_valid().numpy()]
-    return find(points.astype(np.float64), 0.5 * scene.extent)
+    points = _gather_points(scene, camera_rays(sensor, seed), seed)
+    if points is None:
+        return None
+    return find(np.array(points.p).T.astype(np.float64), 0.5 * scene.extent)
+
+
+def _gather_points(scene: Prepared, rays, seed: int):
+    """GatherPoints of these camera rays, or None."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, PILOT_EYE)), dr.width(rays))
+    return scene.trace(sampler, rays)[2]
 
 
 def _rounded(number: float) -> int:
@@ -167,9 +176,7 @@ def automatic_radius(scene: Prepared, rays, seed: int, map_=None) -> float:
     if map_ is None:
         pilot = scene.with_(photon_count=min(scene.settings.photon_count, _PATHS))
         map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(dr.opaque(mi.UInt32, stream_seed(seed, PILOT, PILOT_EYE)), dr.width(rays))
-    points = scene.trace(sampler, rays)[2] if map_.stored else None
+    points = _gather_points(scene, rays, seed) if map_.stored else None
     return radius_at(points, map_, scene, scene.settings.photon_count)
 
 

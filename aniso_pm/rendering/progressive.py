@@ -284,7 +284,8 @@ class Run:
                 try:
                     self.controls.checkpoint.write(self._state())
                 except OutputError as error:
-                    self.statistics["failure"] = str(error)
+                    failures = filter(None, [self.statistics.get("failure"), str(error)])
+                    self.statistics["failure"] = "; ".join(failures)
                     mi.Log(mi.LogLevel.Warn, f"aniso_pm: {error}")
 
     def rendered(self) -> Rendered:

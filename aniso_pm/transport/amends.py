@@ -15,6 +15,7 @@ Nothing is done about emitters that do it right, whatever their version.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,8 +62,9 @@ class Amends:
         return ray, flux * dr.gather(mi.Float, self.factor, emitter, active)
 
 
-def amends(scene) -> Amends | None:
-    """What the emitters of a scene need; None if all of them do right."""
+def amends(scene, evaluated: Container[int] = ()) -> Amends | None:
+    """What the emitters of a scene need; None if all of them do right. evaluated: addresses of
+    those whose textures Mitsuba does not draw from."""
     emitters = scene.emitters()
     turns = np.tile(np.eye(3), (len(emitters), 1, 1))
     centre, radius = np.zeros((len(emitters), 3)), np.zeros(len(emitters))
@@ -73,9 +75,10 @@ def amends(scene) -> Amends | None:
             emitter.set_scene(scene)
         if shape is None:
             continue
-        # (Textured ones look their points and normals up by texture coordinates.)
-        textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-        if shape.class_name() == "Sphere" and not textured:
+        # (Of a texture that is drawn from, points and normals are looked up by its coordinates.)
+        drawn = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+        drawn &= emitter.ptr not in evaluated
+        if shape.class_name() == "Sphere" and not drawn:
             turns[k], box = _turn(shape), shape.bbox()
             if np.abs(turns[k] - np.eye(3)).max() > _WRONG:
                 centre[k], radius[k] = np.array(box.center()), 0.5 * box.extents()[0]

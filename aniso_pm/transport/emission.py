@@ -122,6 +122,7 @@ class Emission:
     environment  Environment, or None where nothing surrounds the scene.
     amends       what the emitters' own rays need to be right, or None.
     share        of the power, of each emitter.
+    members      addresses of the emitters: Dr.Jit traces calls for those of all living scenes.
     evaluated    addresses of the surfaces with a texture that Mitsuba cannot draw from.
     suns         where rays of emitters begin that are infinitely far in one direction, or None:
                  anywhere.
@@ -134,6 +135,7 @@ class Emission:
     environment: Environment | None
     amends: Amends | None = None
     share: tuple[float, ...] = ()
+    members: frozenset[int] = frozenset()
     evaluated: frozenset[int] = frozenset()
     suns: Discs | None = None
 
@@ -187,11 +189,8 @@ class Emission:
 
     def _from_surfaces(self, index, emitter, time, u1, u2, u3, active, wavelengths):
         """(ray, flux) from emitters inside the scene, or infinitely far in one direction."""
-        if self.evaluated:
-            leave = partial(_leave_evaluated, self.evaluated)
-            ray, flux = dr.dispatch(emitter, leave, time, u1, u2, u3, active)
-        else:
-            ray, flux = emitter.sample_ray(time, u1, u2, u3, active)
+        leave = partial(_leave_one, self.members, self.evaluated)
+        ray, flux = dr.dispatch(emitter, leave, time, u1, u2, u3, active)
         if self.suns is not None:
             sun = _is_sun(emitter)
             across, spread = self.suns.sample(u2, ray.d)
@@ -214,16 +213,17 @@ class Emission:
             si = self.scene.ray_intersect(back)
         si.wi = mi.Vector3f(0, 0, 1)
         si.wavelengths = ray.wavelengths
-        drawn = dr.sum(dr.dispatch(emitter, _spectrum_over_density, si, u, active))
+        over_density = partial(_spectrum_over_density, self.members)
+        drawn = dr.sum(dr.dispatch(emitter, over_density, si, u, active))
         si.wavelengths = wavelengths
-        radiance = dr.dispatch(emitter, _spectrum, si, active)
+        radiance = dr.dispatch(emitter, partial(_spectrum, self.members), si, active)
         return radiance * dr.select(drawn > 0, dr.sum(flux) / drawn, 0)
 
 
-def _leave_evaluated(evaluated, emitter, time, u1, u2, u3, active):
+def _leave_one(members, evaluated, emitter, time, u1, u2, u3, active):
     """(ray, flux) of Mitsuba's emitters; of the evaluated ones by a point that is uniform on the
     shape, a direction by the cosine, and the radiance there."""
-    if emitter is None:
+    if emitter is None or emitter.ptr not in members:
         return dr.zeros(mi.Ray3f), mi.Spectrum(0)
     if emitter.ptr not in evaluated:
         return emitter.sample_ray(time, u1, u2, u3, active)
@@ -236,15 +236,16 @@ def _leave_evaluated(evaluated, emitter, time, u1, u2, u3, active):
 
 def _cannot_be_drawn(emitter) -> bool:
     """Does Mitsuba draw no points by the texture of this surface? (Checkerboards, for example.)"""
-    if not (emitter.get_shape() and _varies(emitter)):
+    shape = emitter.get_shape()
+    if not (_varies(emitter) or emitter.class_name() in ("SpotLight", "Projector")):
         return False
     try:
         emitter.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
     except RuntimeError as error:
-        if mi.is_spectral:
+        if mi.is_spectral or shape is None:
             raise Unsupported(
                 f'aniso_pm: emitter "{emitter.id()}" has a texture from which Mitsuba cannot draw '
-                f"({one_line(error)}); use a bitmap or an RGB variant"
+                f"({one_line(error)}); use a bitmap{' or an RGB variant' if shape else ''}"
             ) from error
         return True
     return False
@@ -254,16 +255,16 @@ def _varies(emitter) -> bool:
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
-def _spectrum_over_density(emitter, si, u, active):
+def _spectrum_over_density(members, emitter, si, u, active):
     """L(λ')/p(λ') of the wavelengths si.wavelengths that the emitter has drawn with u."""
-    if emitter is None or emitter.is_environment():
+    if emitter is None or emitter.ptr not in members or emitter.is_environment():
         return mi.Spectrum(0)
     return emitter.sample_wavelengths(si, u, active)[1]
 
 
-def _spectrum(emitter, si, active):
+def _spectrum(members, emitter, si, active):
     """What the emitter's spectrum is at si.wavelengths; the one that its rays are drawn from."""
-    if emitter is None or emitter.is_environment():
+    if emitter is None or emitter.ptr not in members or emitter.is_environment():
         return mi.Spectrum(0)
     found = children(emitter)
     for name in ("intensity", "irradiance", "radiance"):
@@ -283,12 +284,15 @@ def prepare(scene) -> Emission:
         environment = Environment.of(scene)
         if environment.scaling() > 1e-3:
             refuse_scale(scene.environment())
-    found = amends(scene)
     emitters = scene.emitters_dr()
     count = dr.width(emitters)
     textured = any(e.get_shape() is not None and _varies(e) for e in scene.emitters())
+    members = frozenset(e.ptr for e in scene.emitters())
     evaluated = frozenset(e.ptr for e in scene.emitters() if _cannot_be_drawn(e))
-    all_ = Emission(scene, emitters, None, textured, environment, found, evaluated=evaluated)
+    found = amends(scene, evaluated)
+    all_ = Emission(
+        scene, emitters, None, textured, environment, found, members=members, evaluated=evaluated
+    )
     if count == 1:
         return all_
     weight = np.array([e.sampling_weight() for e in scene.emitters()])

@@ -3,9 +3,9 @@
 A sky or a sun lights the whole scene, of bounding sphere (c, R): its rays begin on the disc of
 radius R across them. Where the camera sees a small part of the scene, a house on a wide plain,
 hardly any would meet it. They are therefore spread over nested discs: the first covers the sphere
-(c', ρR) around what most camera rays hit, each next one is four times as wide, and the last is the
-whole one. With chances a_k, centres q_k and radii ρ_k in units of R, a point q of the disc has the
-density p(q) and light there the weight
+(c', ρR) around most of the points where eye paths read the photons, each next one is four times as
+wide, and the last is the whole one. With chances a_k, centres q_k and radii ρ_k in units of R, a
+point q of the disc has the density p(q) and light there the weight
 
     p(q) = Σ_k a_k [|q − q_k| <= ρ_k] / (π ρ_k²),    w(q) = 1 / (π p(q)),
 
@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# The sphere has so much of what is seen within it, and so much to spare.
+# The sphere has so many of the points within it, and so much to spare.
 _MOST, _SPARE = 0.8, 1.25
 # It pays where it is so much smaller than the scene.
 _SMALL = 0.35
@@ -33,14 +33,14 @@ _FEWEST = 64
 
 @dataclass(frozen=True)
 class Focus:
-    """A sphere around what most camera rays hit, world units."""
+    """A sphere around what the camera sees of the photons, world units."""
 
     centre: tuple[float, float, float]
     radius: float
 
 
 def find(points: np.ndarray, radius: float) -> Focus | None:
-    """points: what camera rays hit, (n, 3); radius: of the scene. None where it does not pay."""
+    """points: where eye paths gather, (n, 3); radius: of the scene. None where it does not pay."""
     if len(points) < _FEWEST:
         return None
     centre = np.median(points, axis=0)
@@ -101,8 +101,8 @@ class Discs:
             at, radius = dr.select(number == k, c, at), dr.select(number == k, r, radius)
         q = mi.Point2f(at + radius * q)
         density = mi.Float(0)
-        for chance, (c, r) in zip(self.chances, discs, strict=True):
+        for k, (chance, (c, r)) in enumerate(zip(self.chances, discs, strict=True)):
             # The own disc counts, however numbers are rounded.
-            inside = dr.norm(q - c) <= r * (1 + 1e-4)
+            inside = (number == k) | (dr.norm(q - c) <= r)
             density += dr.select(inside, chance * dr.rcp(dr.square(r)), 0)
         return frame.to_world(mi.Vector3f(q.x, q.y, 0)), dr.select(density > 0, dr.rcp(density), 0)
