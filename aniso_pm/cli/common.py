@@ -105,6 +105,14 @@ def parse_parameters(pairs: list[str] | None, **options: Any) -> dict[str, Any]:
     return {name: _value(text) for name, text in texts.items()}
 
 
+def stopping_rules(
+    passes: int | None, seconds: float | None, target_error: float | None
+) -> dict[str, Any]:
+    """Those that are given, by the names of their parameters."""
+    rules = {"passes": passes, "time": seconds, "target_error": target_error}
+    return {name: value for name, value in rules.items() if value is not None}
+
+
 def _value(text: str) -> Any:
     if text in ("true", "false"):
         return text == "true"

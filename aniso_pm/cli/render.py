@@ -33,6 +33,7 @@ from .common import (
     parse_defines,
     parse_parameters,
     set_variant,
+    stopping_rules,
 )
 from .pictures import Bits, Denoise, Exposure, Pictures, Png, Tonemap
 from .workers import (
@@ -118,7 +119,7 @@ def render(
     """
     # --- Find out what would fail, before anything slow ---
     defines = parse_defines(define or [])
-    rules = {"passes": passes, "time": seconds, "target_error": target_error}
+    rules = stopping_rules(passes, seconds, target_error)
     parameters = parse_parameters(parameter, layers=layer_names, **rules)
     pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
     if not scene.is_file():
@@ -132,7 +133,6 @@ def render(
         world, camera, integrator = load(scene, defines, sensor, integrator_name, parameters)
         loaded = time.perf_counter()
         pictures.check_film(camera.film())
-        rules = {name: value for name, value in rules.items() if value is not None}
         kept = _prepare_passes(integrator, rules, first_pass, resume or keep_state, save_every)
         if state_file.exists() and not resume:
             go_on = "--resume goes on with them, or " * hasattr(integrator, "stop_after")

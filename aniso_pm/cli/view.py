@@ -27,6 +27,7 @@ from .common import (
     parse_defines,
     parse_parameters,
     set_variant,
+    stopping_rules,
 )
 from .pictures import Pictures
 from .render import record_of
@@ -81,15 +82,14 @@ def view(
         import flask  # noqa: F401
     except ImportError as error:
         raise server.missing() from error
+    rules = stopping_rules(passes, seconds, target_error)
     with mitsuba_log(quiet):
         if scene.suffix.lower() == ".state":
             _check_not_given(
                 output=out,
                 define=define,
                 spp=spp,
-                passes=passes,
-                time=seconds,
-                target_error=target_error,
+                **rules,
                 integrator=integrator_name,
                 p=parameter,
                 layers=layer_names,
@@ -100,7 +100,6 @@ def view(
                 out or Path(scene.with_suffix(".exr").name), False, 0, "srgb", 8, False
             )
             defines = parse_defines(define or [])
-            rules = {"passes": passes, "time": seconds, "target_error": target_error}
             parameters = parse_parameters(parameter, layers=layer_names, **rules)
             set_variant(variant)
             world, camera, integrator = load(scene, defines, sensor, integrator_name, parameters)
@@ -110,8 +109,7 @@ def view(
                     "watched; add --integrator aniso_pm"
                 )
             try:
-                given = {name: value for name, value in rules.items() if value is not None}
-                integrator.stop_after(**(given or {"time": _ENDLESS}))
+                integrator.stop_after(**(rules or {"time": _ENDLESS}))
                 if layer_names is not None:
                     integrator.settings = integrator.settings.with_(layers=layer_names)
             except ValueError as error:
