@@ -3,10 +3,12 @@
 import warnings
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm.instruments import gallery
+from aniso_pm.map.photon_map import photon_flux, thinned
 from aniso_pm.rendering import pilot, plan, survey
 from aniso_pm.rendering.film import border
 from aniso_pm.rendering.prepared import prepare
@@ -138,6 +140,48 @@ def test_work_is_counted_once_where_gather_points_need_more_room(variant_llvm_rg
         works.append(survey._trace(scene, sensor, tiles, 0).work)
         assert not rooms
     np.testing.assert_array_equal(*works)
+
+
+def test_a_map_thinned_holds_some_of_the_light_paths(variant_llvm_rgb):
+    world = mi.load_dict(room_with_ball(size=16))
+    scene = prepare(world, Settings(photon_count=4000, map="global"), False)
+    whole = scene.photon_map(5, 0, remember=True)
+    part = thinned(whole, 1000)
+    path = whole.origins.path.numpy()
+    kept = path < 1000
+    assert part.emitted == 1000 and part.stored == kept.sum() < whole.stored
+    np.testing.assert_array_equal(np.sort(part.origins.path.numpy()), np.sort(path[kept]))
+    np.testing.assert_array_equal(part.origins.numbers, whole.origins.numbers[:1000])
+    flux = [photon_flux(map_, slots(map_), True).numpy() for map_ in (whole, part)]
+    assert flux[1].sum() == pytest.approx(flux[0][:, kept].sum(), rel=1e-5)
+    assert thinned(whole, 4000) is whole
+
+
+def slots(map_):
+    return dr.arange(mi.UInt32, map_.stored)
+
+
+def test_a_pilot_gathers_no_more_where_photons_lie_close(variant_llvm_rgb, monkeypatch):
+    """In a room with the light inside, kernels of eight pixels of a small picture hold hundreds."""
+    met = []
+    gathered = survey._gathered
+
+    def watched(*given):
+        found = gathered(*given)
+        met.append(found[2] * given[5])
+        return found
+
+    monkeypatch.setattr(survey, "_gathered", watched)
+    found, _ = settled(room_with_ball(size=128), map="global")
+    few, *all_ = met
+    assert survey._ASKED * few > 4 * survey._MET_BY_ALL  # or there is nothing to leave out
+    assert len(all_) == 4 and max(all_) < 1.5 * survey._MET_BY_ALL
+    monkeypatch.setattr(survey, "_MET_BY_ALL", 1e9)
+    more, _ = settled(room_with_ball(size=128), map="global")
+    # They tell the same, but for widths: where they are less certain kernels are narrower.
+    assert found.count == pytest.approx(more.count, rel=0.3)
+    assert found.share.mean() == pytest.approx(more.share.mean(), abs=0.1)
+    assert 0.6 * more.widths.mean() < found.widths.mean() < 1.1 * more.widths.mean()
 
 
 def test_a_film_of_one_pixel_has_nothing_to_tell_apart(variant_llvm_rgb):

@@ -75,10 +75,24 @@ def caustics(map_: PhotonMap) -> PhotonMap:
     """The caustic photons of a map that marks them, as a map of their own."""
     if map_.stored == 0:
         return map_
-    point = dr.gather(mi.Vector4f, map_.index.points, dr.arange(mi.UInt32, map_.stored))
+    point = _points(map_, dr.arange(mi.UInt32, map_.stored))
     word = dr.reinterpret_array(mi.UInt32, point.w)
-    slot = dr.compress(is_caustic(word))
-    point = dr.gather(mi.Vector4f, map_.index.points, slot)
+    return _part(map_, dr.compress(is_caustic(word)), map_.emitted)
+
+
+def thinned(map_: PhotonMap, light_paths: int) -> PhotonMap:
+    """The photons of so many light paths of a map that knows its ``origins``, as a map of their
+    own."""
+    if map_.stored == 0 or light_paths >= map_.emitted:
+        return map_
+    part = _part(map_, dr.compress(map_.origins.path < light_paths), light_paths)
+    origins = replace(part.origins, numbers=map_.origins.numbers[:light_paths])
+    return replace(part, origins=origins)
+
+
+def _part(map_: PhotonMap, slot, emitted: int) -> PhotonMap:
+    """The photons in these slots, as a map of so many light paths."""
+    point = _points(map_, slot)
     photons = Photons(
         mi.Point3f(point.x, point.y, point.z),
         dr.reinterpret_array(mi.UInt32, point.w),
@@ -87,8 +101,12 @@ def caustics(map_: PhotonMap) -> PhotonMap:
         None if map_.origins is None else dr.gather(mi.UInt32, map_.origins.path, slot),
     )
     dr.eval(photons)
-    nothing = replace(map_, stored=0, index=None, flux=None, direction=None)
+    nothing = replace(map_, emitted=emitted, stored=0, index=None, flux=None, direction=None)
     return indexed(photons, dr.width(slot), nothing)
+
+
+def _points(map_: PhotonMap, slot):
+    return dr.gather(mi.Vector4f, map_.index.points, slot)
 
 
 def indexed(photons: Photons, stored: int, nothing: PhotonMap) -> PhotonMap:

@@ -27,7 +27,7 @@ import numpy as np
 
 from .. import arrays
 from ..map.gather_points import take
-from ..map.photon_map import PhotonMap, caustics
+from ..map.photon_map import PhotonMap, caustics, thinned
 from ..map.spectra import channel_mean
 from ..transport import aim
 from ..transport.survey_parts import Parts
@@ -56,6 +56,11 @@ _CAMERA, _VERTEX = 0.3, 0.4
 # Work of a pass that is not to be exceeded where passes may have any length (see ``Plan.of``): a
 # third of a second.
 _LONGEST = 1.5e6
+# Photons that a map shows to the widest kernels of all pairs, at the most: more of them take longer
+# and tell nothing new. One gather point in so many is asked how many there would be.
+_MET_BY_ALL, _ASKED = 2e6, 16
+# Light paths of a map that are left at least.
+_FEWEST = 2000
 # Another use of the map than "global" has to promise an error smaller by so much.
 _BETTER = 0.9
 # Path tracing has found the caustics if it has so much of their light, by as many hits.
@@ -271,21 +276,23 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
     """weigh: pairs of gathered light → weight of each pair."""
     colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
     lanes = tiles.lanes
+    kernels = [_kernels(scene, sensor, radius, width) for width in (NARROW, WIDE)]
+    asked = take(points, dr.arange(mi.UInt32, -(-dr.width(points.lane) // _ASKED)) * _ASKED)
+    dr.eval(asked)  # so that the kernel is that of all points
+    _, _, few = _gathered(*kernels[0], seed, asked, colours, lanes, maps[0], None)
+    most = few * _ASKED * lanes * (1 if radius else (WIDE / NARROW) ** 2)
+    if most > _MET_BY_ALL:
+        left = int(maps[0].emitted * _MET_BY_ALL / most)
+        maps = [thinned(map_, max(left, _FEWEST)) for map_ in maps]
+
     found: list[Any] = []
-    for width in (NARROW, WIDE) if not radius else (1.0, 1.0):
-        size = radius
-        if not radius:  # kernels as wide as they are told to be
-            size = 0.1 * scene.extent
-            free = footprint.of(sensor, size, width)
-            assert free  # else a radius is given (see ``pilot.settle``)
-            free = replace(free, least=dr.opaque(mi.Float, 1e-6))
-            scene = replace(scene, footprint=free)
-        scores: list[Any] = [None, None]
+    scores: list[Any] = [None, None]
+    for scene_, size in kernels:
         if found:
             weight = weigh(0.5 * (found[0][0][0] + found[0][1][0]))
             weight = arrays.own(mi.Float, np.repeat(weight, 2 * SAMPLES).astype(np.float32))
             scores = [(dr.zeros(mi.Float, max(map_.stored, 1)), weight) for map_ in maps]
-        gather = partial(_gathered, scene, size, seed, points, colours, lanes)
+        gather = partial(_gathered, scene_, size, seed, points, colours, lanes)
         found.append([gather(*each) for each in zip(maps, scores, strict=True)])
     (a, over_lobes, met), (b, _, _) = found[0]
     (wide_a, _, _), (wide_b, _, _) = found[1]
@@ -293,6 +300,17 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
     learned = _learned(maps, [column for column, _ in scores])
     emitted, stored = maps[0].emitted, maps[0].stored
     return Found(a, b, wide_a, wide_b, over_lobes, met, each, emitted, stored, learned)
+
+
+def _kernels(scene: Prepared, sensor, radius, width: float) -> tuple[Prepared, float]:
+    """The scene, and a bandwidth, with which kernels have the given radius, or are as wide as they
+    are told to be, in pixels."""
+    if radius:
+        return scene, radius
+    size = 0.1 * scene.extent
+    free = footprint.of(sensor, size, width)
+    assert free  # else a radius is given (see ``pilot.settle``)
+    return replace(scene, footprint=replace(free, least=dr.opaque(mi.Float, 1e-6))), size
 
 
 def _learned(maps, columns) -> aim.Learned | None:
