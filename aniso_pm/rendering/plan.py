@@ -88,9 +88,9 @@ class Found:
 @dataclass(frozen=True)
 class Plan:
     """The best that can be done with a use of the map; see the module's head and ``Survey``. share
-    and widths are those of tiles, error is the relative MSE, work that of a pass; path_work (of an
-    eye path), gathered (light) and noise (variance of gathers) are those of pairs; lobes is the
-    part of the error that kernels make which follow lobes."""
+    and widths are those of tiles, error is the relative MSE, work that of a pass, light_work that of
+    its light paths; path_work (of an eye path), gathered (light) and noise (variance of gathers)
+    are those of pairs; lobes is the part of the error that kernels make which follow lobes."""
 
     tiles: Tiles
     use: Use
@@ -100,6 +100,7 @@ class Plan:
     widths: np.ndarray
     error: float
     work: float
+    light_work: float
     path_work: np.ndarray
     gathered: np.ndarray
     noise: np.ndarray
@@ -108,14 +109,15 @@ class Plan:
 
     @staticmethod
     def of(longest: float, each: int, **given) -> Plan:
-        """Of passes whose work is ``longest`` at most; up to four times as long where they would
-        have less than FEW samples a pixel, and with one sample of any length. given: as of
-        ``_of``."""
+        """Of passes whose work is ``longest`` at most. Where they would have less than FEW samples
+        a pixel, up to four times as long, if their light paths alone are no more work than that;
+        with one sample of any length. given: as of ``_of``."""
         plan = Plan._of(each, **given)
-        for limit, least in ((longest, FEW), (4 * longest, 1)):
-            if plan.work > limit and plan.each > least:
-                fewer = max(least, int(plan.each * limit / plan.work))
-                plan = Plan._of(fewer, **given)
+        if plan.work > longest and plan.each > FEW:
+            plan = Plan._of(max(FEW, int(plan.each * longest / plan.work)), **given)
+        too_long = max(plan.work / 4, plan.light_work) / longest
+        if too_long > 1 and plan.each > 1:
+            plan = Plan._of(max(1, int(plan.each / too_long)), **given)
         return plan
 
     @staticmethod
@@ -165,6 +167,7 @@ class Plan:
                 widths=np.ones(1),
                 error=error,
                 work=pass_,
+                light_work=0.0,
                 path_work=work,
                 gathered=nothing,
                 noise=nothing,
@@ -216,6 +219,7 @@ class Plan:
             widths=widths,
             error=error,
             work=pass_,
+            light_work=paths * light,
             path_work=work + gather,
             gathered=found.light.mean(1),
             noise=(noise.gather + noise.alone * thinner) / (filtered * share),
