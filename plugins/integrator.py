@@ -146,8 +146,9 @@ class AnisoPhotonMapper:
 
      * - edge_compensation
        - |bool|
-       - Divide each estimate by the share of its kernel that lies on the surface, found by short
-         rays. Without it every edge is dark. (Default: |true|)
+       - Divide each estimate by the share of its kernel that lies on the surface, and end kernels
+         at walls that stand on it, both found by short rays. Without it every edge is dark, and
+         light leaks along the feet of walls. (Default: |true|)
 
      * - max_depth
        - |int|

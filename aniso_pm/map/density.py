@@ -15,8 +15,8 @@ loses what its kernel spills over the edge. Points drawn from the kernel are pro
 along −n, through glass that covers the surface but not through what light does not pass, until the
 first one lands; the number of points is geometrically distributed with mean 1/m, so it *is* an
 estimate of 1/m, unbiased but for the end after PROBES_MAX points, at the price of one ray wherever
-the kernel spills nothing. A surface that goes on behind a wall counts as well, and so does one
-inside a solid that is higher than the slab: there the estimate stays dark.
+the kernel spills nothing. What lies behind a wall that stands on the surface is no part of the
+kernel (``walls``).
 """
 
 from __future__ import annotations
@@ -194,6 +194,8 @@ def _filter(points: GatherPoints, max_depth):
             yes &= segments(word) <= allowed
         if points.caustic is not None:
             yes &= is_caustic(word) | ~points.caustic
+        if points.wall is not None:
+            yes &= ~points.wall.hides(d)
         return yes
 
     return counts
@@ -287,6 +289,8 @@ def probe_surface(
         si = scene.ray_intersect(probe, mi.RayFlags.Minimal, True, probing)
         cosine, d = dr.dot(si.n, n), si.p - points.p
         on_surface = si.is_valid() & (dr.abs(cosine) > NORMAL_COS)
+        if dr.hint(points.wall is not None, mode="scalar"):
+            on_surface &= ~points.wall.hides(d)
         on_surface &= smooth_between(n, dr.mulsign(mi.Vector3f(si.n), cosine), d, rounding)
         # Backs are passed: light arrives between them and the surface. So is glass, which is the
         # surface where their faces coincide. Under all else no light arrives.

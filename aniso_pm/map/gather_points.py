@@ -25,6 +25,7 @@ class GatherPoints:
                the map's only if it holds caustics alone.)
     distance   length of the path from the camera, world units; None where nobody asks.
     later      has the path left a gathered part before? None where nobody asks, or none has.
+    wall       walls.Wall beside the point; None where nobody looks.
     """
 
     lane: Any
@@ -39,6 +40,7 @@ class GatherPoints:
     caustic: Any
     distance: Any = None
     later: Any = None
+    wall: Any = None
 
 
 def map_tree(function, *trees: Any) -> Any:

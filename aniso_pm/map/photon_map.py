@@ -85,9 +85,11 @@ def thinned(map_: PhotonMap, light_paths: int) -> PhotonMap:
     own."""
     if map_.stored == 0 or light_paths >= map_.emitted:
         return map_
+    assert map_.origins
     part = _part(map_, dr.compress(map_.origins.path < light_paths), light_paths)
-    origins = replace(part.origins, numbers=map_.origins.numbers[:light_paths])
-    return replace(part, origins=origins)
+    assert part.origins
+    numbers = map_.origins.numbers[:light_paths]
+    return replace(part, origins=replace(part.origins, numbers=numbers))
 
 
 def _part(map_: PhotonMap, slot, emitted: int) -> PhotonMap:

@@ -88,8 +88,8 @@ class Found:
 @dataclass(frozen=True)
 class Plan:
     """The best that can be done with a use of the map; see the module's head and ``Survey``. share
-    and widths are those of tiles, error is the relative MSE, work that of a pass, light_work that of
-    its light paths; path_work (of an eye path), gathered (light) and noise (variance of gathers)
+    and widths are those of tiles, error is the relative MSE, work that of a pass, light_work that
+    of its light paths; path_work (of an eye path), gathered (light) and noise (variance of gathers)
     are those of pairs; lobes is the part of the error that kernels make which follow lobes."""
 
     tiles: Tiles

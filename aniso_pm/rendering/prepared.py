@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import Unsupported
-from ..map import density, summed
+from ..map import density, summed, walls
 from ..map.gather_points import GatherPoints, map_tree, take
 from ..map.photon_map import EMPTY, PhotonMap
 from ..map.receivers import read_cover
@@ -216,12 +217,35 @@ class Prepared(Decisions):
             return radius
         return radius * self.footprint.share(points.distance, points.lane, TRIED)
 
+    def walled(self, points: GatherPoints, kernel, thickness, seed: int) -> GatherPoints:
+        """The same points with the walls beside them, where edges are compensated."""
+        if not self.settings.edge_compensation:
+            return points
+        cover = self._cover
+        wall = walls.nearest(
+            self.scene,
+            seed,
+            points,
+            kernel,
+            math.sqrt(density.CUT2),
+            0.5 * density.SLAB * thickness,
+            (lambda bsdf, active: cover(bsdf, active)[1]) if cover else None,
+        )
+        return replace(points, wall=wall)
+
+    @property
+    def _cover(self):
+        """A function as ``receivers.read_cover``; None where every surface gathers and none lets
+        light pass."""
+        return partial(read_cover, receivers=self.needs.receiving) if self.deep else None
+
     def _gather(self, map_, radius, seed, points, surface, scores, for_layers) -> density.Gathered:
         if scores is not None:
             scores = scores[0], dr.gather(mi.Float, scores[1], points.lane)
         thickness = self.thickness(points, radius)
         radius = self.bandwidth(points, radius)
         kernel, follows, degenerate = density.kernels(points, radius, self.kernel_options)
+        points = self.walled(points, kernel, thickness, seed)
         L, count = density.estimate(
             map_,
             points,
@@ -249,10 +273,8 @@ class Prepared(Decisions):
             )
         lost = mi.Bool(False)
         if self.settings.edge_compensation:
-            receivers = self.needs.receiving
-            cover = partial(read_cover, receivers=receivers) if self.deep else None
             inverse, lost = density.probe_surface(
-                self.scene, seed, points, kernel, thickness, count > 0, cover
+                self.scene, seed, points, kernel, thickness, count > 0, self._cover
             )
             L *= inverse
             light = map_tree(lambda part: part * inverse, light)

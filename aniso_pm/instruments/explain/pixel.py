@@ -162,7 +162,15 @@ def explain(
         kernel=kernel,
         photons_inside=int(inside[chosen]),
         contribution=tuple(map(float, radiance[chosen])),
-        photons=_photons(prepared, map_, point, radius, thickness, outlines),
+        photons=_photons(
+            prepared,
+            map_,
+            take(numbered, mi.UInt32(chosen)),
+            radius,
+            thickness,
+            outlines,
+            probe_seed,
+        ),
         outlines=outlines,
     )
 
@@ -347,9 +355,12 @@ def _in_lobe(lobe: Lobe, n, s, t):
     return np.stack([v @ np.array(lobe.x), v @ np.array(lobe.y)], axis=1)
 
 
-def _photons(prepared: Prepared, map_, point, radius: float, thickness: float, outlines) -> Photons:
-    """Photons in a window around the kernel."""
+def _photons(
+    prepared: Prepared, map_, point, radius: float, thickness: float, outlines, seed: int
+) -> Photons:
+    """Photons in a window around the kernel. seed: of density estimation."""
     plane, _, _ = density.kernels(point, mi.Float(radius), prepared.kernel_options)
+    point = prepared.walled(point, plane, mi.Float(thickness), seed)
     limit = prepared.gather_depth
     counted = density.photons_inside(map_, point, plane, mi.Float(thickness), limit).numpy()
     at = dr.gather(mi.Vector4f, map_.index.points, dr.arange(mi.UInt32, map_.stored))
