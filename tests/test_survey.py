@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -152,13 +153,10 @@ def test_a_map_thinned_holds_some_of_the_light_paths(variant_llvm_rgb):
     assert part.emitted == 1000 and part.stored == kept.sum() < whole.stored
     np.testing.assert_array_equal(np.sort(part.origins.path.numpy()), np.sort(path[kept]))
     np.testing.assert_array_equal(part.origins.numbers, whole.origins.numbers[:1000])
-    flux = [photon_flux(map_, slots(map_), True).numpy() for map_ in (whole, part)]
+    slots = [dr.arange(mi.UInt32, map_.stored) for map_ in (whole, part)]
+    flux = [photon_flux(*each, True).numpy() for each in zip((whole, part), slots, strict=True)]
     assert flux[1].sum() == pytest.approx(flux[0][:, kept].sum(), rel=1e-5)
     assert thinned(whole, 4000) is whole
-
-
-def slots(map_):
-    return dr.arange(mi.UInt32, map_.stored)
 
 
 def test_a_pilot_gathers_no_more_where_photons_lie_close(variant_llvm_rgb, monkeypatch):
@@ -182,6 +180,26 @@ def test_a_pilot_gathers_no_more_where_photons_lie_close(variant_llvm_rgb, monke
     assert found.count == pytest.approx(more.count, rel=0.3)
     assert found.share.mean() == pytest.approx(more.share.mean(), abs=0.1)
     assert 0.6 * more.widths.mean() < found.widths.mean() < 1.1 * more.widths.mean()
+
+
+@pytest.mark.parametrize(
+    ("light", "eye", "each"),
+    [
+        (0, 1e4, 27),  # short
+        (0, 2e5, 7),  # long by its eye paths: within the limit
+        (1e5, 1e6, 4),  # no fewer than four samples, up to four times as long
+        (1e5, 3e6, 1),
+        (1.3e6, 1e4, 1),  # long by its light paths: no such allowance
+    ],
+)
+def test_passes_of_open_end_are_short(monkeypatch, light, eye, each):
+    """light, eye: work of a pass with one sample a pixel."""
+
+    def of(each, **_):
+        return SimpleNamespace(each=each, light_work=light * each, work=(light + eye) * each)
+
+    monkeypatch.setattr(plan.Plan, "_of", staticmethod(of))
+    assert plan.Plan.of(1.5e6, 27).each == each
 
 
 def test_a_film_of_one_pixel_has_nothing_to_tell_apart(variant_llvm_rgb):
