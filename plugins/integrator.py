@@ -128,8 +128,8 @@ class AnisoPhotonMapper:
          :math:`|s \times t| = r^2`, cut at :math:`a^2+b^2=4`. 0 chooses the radius at which a
          kernel holds 60 photons, in the median over the light that the camera sees
          (``statistics["initial_radius"]``), and makes kernels narrower where the light that a pilot
-         finds is not smooth: 1 to 32 widths of a pixel where the kernel is, between twice that
-         radius and a quarter of it in the first four passes, 1/(i+1) of it in pass i.
+         finds is not smooth: 1 to 32 widths of a pixel where the kernel is, between four times
+         that radius and a quarter of it in the first four passes, 1/(i+1) of it in pass i.
          (Default: 0)
 
      * - alpha

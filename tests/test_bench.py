@@ -11,6 +11,7 @@ from aniso_pm import cli
 from aniso_pm.instruments.bench import GROUPS, grid, kernels, memory, rooms, timing, walls
 from aniso_pm.instruments.bench.row import Row, as_data, line, summary
 from aniso_pm.map import index as spatial
+from rooms import room
 
 
 @pytest.fixture(autouse=True)
@@ -143,6 +144,26 @@ def test_unknown_groups_are_named(capsys):
     message = capsys.readouterr().err
     assert "'speed'" in message and all(group in message for group in GROUPS)
     assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["pass", "--scene", "any.xml"], "--scene is for the group error"),
+        (["error", "--scene", "missing.xml"], "missing.xml"),
+    ],
+)
+def test_scenes_are_for_the_group_error_and_have_to_be_there(capsys, given, said):
+    assert cli.main(["bench", *given]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_scene_without_reference_is_a_row_that_says_how_to_make_one(tmp_path, capsys):
+    scene = tmp_path / "room.xml"
+    mi.xml.dict_to_xml(room(size=16), str(scene))
+    assert cli.main(["bench", "error", "--scene", str(scene), "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["figure"] is None and "aniso-pm reference" in row["note"]
 
 
 def test_bench_prints_json(capsys):

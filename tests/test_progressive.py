@@ -313,7 +313,7 @@ def test_automatic_radius_suits_a_coin_and_a_stadium(scale):
     print(f"scale {scale}: radius {s['initial_radius']:.4g}")
     even = math.sqrt(24 * 60 / s["photons_stored"] / (4 * math.pi))
     assert 0.5 * even < s["initial_radius"] / scale < even
-    # By itself a kernel may be twice as wide, where light is smooth.
+    # By itself a kernel may be four times as wide, where light is smooth.
     plugin = integrator(initial_radius=s["initial_radius"], photon_count=50_000)
     render(mi.load_dict(definition), plugin, 4)
     s = plugin.statistics

@@ -199,7 +199,37 @@ def test_passes_of_open_end_are_short(monkeypatch, light, eye, each):
         return SimpleNamespace(each=each, light_work=light * each, work=(light + eye) * each)
 
     monkeypatch.setattr(plan.Plan, "_of", staticmethod(of))
-    assert plan.Plan.of(1.5e6, 27).each == each
+    assert plan.Plan.of(1.5e6, 27, light_paths=0).each == each
+
+
+@pytest.mark.parametrize(
+    ("light", "eye", "given", "paths"),
+    [
+        (1e6, 1e4, 0, 1e6),
+        (4e6, 1e4, 0, 1.5e6),  # as long as a pass may be
+        (9e6, 3e6, 0, 3e6),  # as long as the eye paths beside them
+        (4e6, 1e4, 4e6, 4e6),  # somebody wants them
+    ],
+)
+def test_light_paths_of_one_sample_a_pixel_make_no_long_pass(monkeypatch, light, eye, given, paths):
+    """light, eye: work of a pass, whatever its samples; each light path's is one."""
+
+    def of(each, *, light_paths):
+        paths = light_paths or light
+        return SimpleNamespace(each=each, light_paths=paths, light_work=paths, work=paths + eye)
+
+    monkeypatch.setattr(plan.Plan, "_of", staticmethod(of))
+    assert plan.Plan.of(1.5e6, 1, light_paths=given).light_paths == pytest.approx(paths)
+
+
+def test_path_tracing_has_found_caustics_by_many_hits_or_where_there_are_next_to_none():
+    weight, there = np.ones(1000), np.full((1000, 2), 0.1)
+    many, few = np.zeros((1000, 2)), np.zeros((1000, 2))
+    many[:200, 0], few[:20, 0] = 1.0, 10.0  # the light of the map, by 200 hits and by 20
+    assert survey._has_found(many, there, weight)
+    assert not survey._has_found(few, there, weight)
+    assert not survey._has_found(0.5 * many, there, weight)
+    assert survey._has_found(0 * many, 1e-3 * there, weight)
 
 
 def test_a_film_of_one_pixel_has_nothing_to_tell_apart(variant_llvm_rgb):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from aniso_pm.errors import InputError
 
-from .common import Variant, mitsuba_log, set_variant
+from .common import Variant, load, mitsuba_log, set_variant
 
 
 def bench(
@@ -19,6 +20,14 @@ def bench(
             help="What to measure; by default all but error, large and denoise, which take long.",
         ),
     ] = None,
+    scenes: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--scene",
+            help="Scene that error renders instead of the gallery; it needs a reference (aniso-pm "
+            "reference). Can be repeated.",
+        ),
+    ] = None,
     variant: Variant = "llvm_ad_rgb",
     quick: Annotated[
         bool, typer.Option("--quick", help="Smaller sizes, fewer repetitions; less than a minute.")
@@ -27,7 +36,8 @@ def bench(
 ) -> int:
     """Measure speed and memory and print each target beside the figure.
 
-    Kernels are compiled before anything is timed, and what is compared is measured in turn. With
+    Kernels are compiled before anything is timed, and what is compared is measured in turn. "error
+    --scene FILE" compares this package as installed with Mitsuba's path on that scene. With
     --json: a list of objects with name, figure (null if it could not be measured), unit, target
     (such as ">= 0.85"; null where the line informs only), met (true, false or null) and note.
     Exit status 0 also where a target is missed.
@@ -41,8 +51,12 @@ def bench(
                 f"there is nothing to measure by the name '{group}'; there are "
                 f"{', '.join(GROUPS)} and all"
             )
+    if scenes and "error" not in groups:
+        raise InputError("--scene is for the group error: aniso-pm bench error --scene FILE")
     wanted = [group for group in GROUPS if group in groups or "all" in groups]
     set_variant(variant)
+    for file in scenes or []:
+        load(file, {}, 0, needed=False)  # what is wrong with it is said before anything is rendered
 
     from aniso_pm.instruments.bench import measure
     from aniso_pm.instruments.bench.row import HEADER, as_data, line, summary
@@ -52,7 +66,7 @@ def bench(
         print(HEADER)
     rows = []
     with mitsuba_log(quiet=False):
-        for row in measure(wanted, quick):
+        for row in measure(wanted, quick, scenes):
             rows.append(row)
             if not as_json:
                 print(line(row), flush=True)

@@ -53,7 +53,7 @@ PASSES = 32
 # Smallest share of eye paths that gather.
 LEAST_SHARE = 1 / 8
 # Work of a gather, each photon it meets, a light path, a photon it leaves; an eye path is about 1.
-_GATHER, _MET, LIGHT_PATH, LEFT = 1.2, 1 / 40, 0.6, 0.4
+_GATHER, _MET, LIGHT_PATH, LEFT = 2.0, 1 / 30, 0.6, 0.4
 # Variance of an eye sample among a few hundred stratified ones, as a share of that among SAMPLES:
 # 0.59 among 52 and falling, in direct light.
 STRATIFIED = 0.45
@@ -111,13 +111,18 @@ class Plan:
     def of(longest: float, each: int, **given) -> Plan:
         """Of passes whose work is ``longest`` at most. Where they would have less than FEW samples
         a pixel, up to four times as long, if their light paths alone are no more work than that;
-        with one sample of any length. given: as of ``_of``."""
+        with one sample as long as its eye paths ask for. given: as of ``_of``."""
         plan = Plan._of(each, **given)
         if plan.work > longest and plan.each > FEW:
             plan = Plan._of(max(FEW, int(plan.each * longest / plan.work)), **given)
         too_long = max(plan.work / 4, plan.light_work) / longest
         if too_long > 1 and plan.each > 1:
             plan = Plan._of(max(1, int(plan.each / too_long)), **given)
+        most = max(longest, plan.work - plan.light_work)
+        if plan.light_work > most and not given["light_paths"]:
+            # Passes add up: more of them, each with fewer light paths, are as good.
+            fewer = plan.light_paths * most / plan.light_work
+            plan = Plan._of(plan.each, **given | {"light_paths": fewer})
         return plan
 
     @staticmethod
@@ -126,7 +131,7 @@ class Plan:
         *,
         tiles: Tiles,
         choose: bool,
-        light_paths: int | None,
+        light_paths: float | None,
         filtered: float,
         total: float,
         whole,

@@ -11,7 +11,8 @@ path tracing and tell apart what each use leaves to them (see ``survey_parts``).
 
 is chosen, its error after the work of M passes of path tracing, C_0 for each path. Path tracing
 finds some caustics by rare hits that a pilot may miss, so that their variance seems small; it is
-chosen only where it has found the caustics that the map holds, by many hits.
+chosen only where it has found the caustics that the map holds, by many hits, or where these are
+next to none.
 """
 
 from __future__ import annotations
@@ -61,10 +62,13 @@ _LONGEST = 1.5e6
 _MET_BY_ALL, _ASKED = 2e6, 16
 # Light paths of a map that are left at least.
 _FEWEST = 2000
-# Another use of the map than "global" has to promise an error smaller by so much.
+# The same vertices of paths that go on after they have left gather points.
+_GOING_ON = 1.15
+# The caustic map has to promise an error smaller than the global one by so much.
 _BETTER = 0.9
-# Path tracing has found the caustics if it has so much of their light, by as many hits.
-_FOUND, _HITS = 0.7, 64
+# Path tracing has found the caustics if it has so much of their light, by as many hits, or if they
+# are less than such a share of the picture's light.
+_FOUND, _HITS, _NOTHING = 0.7, 64, 1e-3
 
 
 @dataclass(frozen=True)
@@ -152,20 +156,21 @@ def look(
     decide = partial(decide, weight=weight)
     best = decide(use="global", v_own=v_own, found=found, work=seen.early)
     errors: dict[str, float | None] = {"global": best.error}
-    chosen, limit = (maps[0], first), _BETTER * best.error
+    chosen: tuple[Any, Any] = maps[0], first
 
     # --- The other ones, unless their eye paths alone are too dear ---
     light = own + seen.later
     more = within(light, light, weight) - v_own
     bare = decide(use="none", v_own=v_own, later=more)
-    if bare.error < limit:
+    if bare.error < best.error:
         maps = [caustics(map_) for map_ in maps]
         any_ = replace(seen.points, caustic=dr.full(mi.Bool, False, dr.width(seen.points.lane)))
         found = read(maps, any_, lambda _: weight)
-        plan = decide(use="caustic", v_own=v_own, found=found, later=more)
+        work = _GOING_ON * seen.work
+        plan = decide(use="caustic", v_own=v_own, found=found, later=more, work=work)
         errors["caustic"] = plan.error
-        if plan.error < limit:
-            best, chosen, limit = plan, (maps[0], any_), plan.error
+        if plan.error < _BETTER * best.error:
+            best, chosen = plan, (maps[0], any_)
         if scene.photons_are_dispensable:
             errors["none"] = None
             if _has_found(seen.caustic, found.light, weight):
@@ -173,7 +178,7 @@ def look(
                 more = within(light, light, weight) - v_own
                 plan = decide(use="none", v_own=v_own, later=more)
                 errors["none"] = plan.error
-                if plan.error < limit:
+                if plan.error < best.error:
                     best, chosen = plan, (None, None)
     return _survey(best, errors, pixel_counts(best, scene, sensor, seed), *chosen)
 
@@ -329,9 +334,11 @@ def _learned(maps, columns) -> aim.Learned | None:
 
 
 def _has_found(caustic, light, weight) -> bool:
-    """Have eye paths found the caustics of the map, by enough hits?"""
+    """Have eye paths found the caustics of the map, by enough hits, or are these next to none?"""
     root = np.sqrt(weight)[:, None]
     hits, there = (caustic * root).ravel(), float((light * root).mean())
+    if there < _NOTHING:
+        return True
     squares = float((hits**2).sum())
     enough = squares == 0 or float(hits.sum()) ** 2 >= _HITS * squares
     return enough and float(hits.mean()) >= _FOUND * there

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 from aniso_pm.errors import InputError
 
@@ -34,16 +36,18 @@ GROUPS = {
 LONG = ("error", "large", "denoise")
 
 
-def measure(groups: list[str], quick: bool) -> Iterator[Row]:
+def measure(groups: list[str], quick: bool, scenes: list[Path] | None = None) -> Iterator[Row]:
     """The rows of the named groups, as they are measured. A Mitsuba variant has to be set.
 
-    quick  smaller sizes, fewer repetitions, no slow row: less than a minute for all but ``LONG``,
-           but too small for some of the targets.
+    quick   smaller sizes, fewer repetitions, no slow row: less than a minute for all but ``LONG``,
+            but too small for some of the targets.
+    scenes  that "error" renders instead of the gallery.
     """
     for group in groups:
         module, function = GROUPS[group]
+        more: dict[str, Any] = {"files": scenes} if group == "error" else {}
         try:
-            yield from getattr(import_module(f"{__name__}.{module}"), function)(quick)
+            yield from getattr(import_module(f"{__name__}.{module}"), function)(quick, **more)
         except InputError as error:
             yield Row(group, None, "×", None, str(error))
         except ModuleNotFoundError as error:

@@ -60,7 +60,7 @@ def measure(
     files: list[Path] | None = None,
     plugins: dict[str, dict[str, Any]] | None = None,
 ) -> Iterator[Row]:
-    """Rows of the gallery, or of other scenes that have references.
+    """Rows of the gallery, or of other scenes that have references, in the size of their films.
 
     quick    one second and three seeds only.
     plugins  name → plugin, photon mappers to be compared with ``path``; None: as installed, and
@@ -68,7 +68,10 @@ def measure(
     """
     budgets, seeds = ((1.0,), 3) if quick else (BUDGETS, SEEDS)
     for file in files or [scene.file for scene in gallery.scenes()]:
-        yield from _scene(Path(file), list(budgets), seeds, plugins, _SIZE)
+        try:
+            yield from _scene(Path(file), list(budgets), seeds, plugins, {} if files else _SIZE)
+        except InputError as error:  # no reference, or of another size
+            yield Row(f"error: {Path(file).stem}", None, "×", None, str(error))
 
 
 def measure_large(quick: bool) -> Iterator[Row]:
