@@ -11,7 +11,6 @@ from aniso_pm import cli
 from aniso_pm.instruments.bench import GROUPS, grid, kernels, memory, rooms, timing, walls
 from aniso_pm.instruments.bench.row import Row, as_data, line, summary
 from aniso_pm.map import index as spatial
-from rooms import room
 
 
 @pytest.fixture(autouse=True)
@@ -158,9 +157,8 @@ def test_scenes_are_for_the_group_error_and_have_to_be_there(capsys, given, said
     assert said in capsys.readouterr().err
 
 
-def test_a_scene_without_reference_is_a_row_that_says_how_to_make_one(tmp_path, capsys):
-    scene = tmp_path / "room.xml"
-    mi.xml.dict_to_xml(room(size=16), str(scene))
+def test_a_scene_without_reference_is_a_row_that_says_how_to_make_one(write_scene, capsys):
+    scene = write_scene()
     assert cli.main(["bench", "error", "--scene", str(scene), "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["figure"] is None and "aniso-pm reference" in row["note"]
