@@ -229,7 +229,8 @@ def test_path_tracing_has_found_caustics_by_many_hits_or_where_there_are_next_to
     assert survey._has_found(many, there, weight)
     assert not survey._has_found(few, there, weight)
     assert not survey._has_found(0.5 * many, there, weight)
-    assert survey._has_found(0 * many, 1e-3 * there, weight)
+    assert survey._has_found(0 * many, 5e-4 * there, weight)
+    assert not survey._has_found(0 * many, 5e-3 * there, weight)
 
 
 def test_a_film_of_one_pixel_has_nothing_to_tell_apart(variant_llvm_rgb):

@@ -68,7 +68,7 @@ _GOING_ON = 1.15
 _BETTER = 0.9
 # Path tracing has found the caustics if it has so much of their light, by as many hits, or if they
 # are less than such a share of the picture's light.
-_FOUND, _HITS, _NOTHING = 0.7, 64, 1e-3
+_FOUND, _HITS, _NOTHING = 0.7, 64, 1e-4
 
 
 @dataclass(frozen=True)
