@@ -2,13 +2,14 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm import cli
-from aniso_pm.instruments.bench import GROUPS, grid, kernels, memory, rooms, timing, walls
+from aniso_pm.instruments.bench import GROUPS, errors, grid, kernels, memory, rooms, timing, walls
 from aniso_pm.instruments.bench.row import Row, as_data, line, summary
 from aniso_pm.map import index as spatial
 
@@ -162,6 +163,24 @@ def test_a_scene_without_reference_is_a_row_that_says_how_to_make_one(write_scen
     assert cli.main(["bench", "error", "--scene", str(scene), "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["figure"] is None and "aniso-pm reference" in row["note"]
+
+
+def test_a_run_without_a_picture_in_time_is_a_note_and_no_number(write_scene, capsys, monkeypatch):
+    scene = write_scene()
+    assert cli.main(["reference", str(scene), "--spp", "16", "--quiet"]) == 0
+    run = errors.runs.run
+
+    def late(stage, method, *given):
+        found = run(stage, method, *given)
+        return found if method.name == "path" else replace(found, passes=[0])
+
+    monkeypatch.setattr(errors.runs, "run", late)
+    monkeypatch.setattr(errors.runs, "warm_up", lambda *_: None)
+    capsys.readouterr()
+    assert cli.main(["bench", "error", "--quick", "--scene", str(scene), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert rows and all(row["figure"] is None for row in rows)
+    assert all("in 3 of 3 runs" in row["note"] for row in rows)
 
 
 def test_bench_prints_json(capsys):

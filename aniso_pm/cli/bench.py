@@ -51,9 +51,9 @@ def bench(
                 f"there is nothing to measure by the name '{group}'; there are "
                 f"{', '.join(GROUPS)} and all"
             )
-    if scenes and "error" not in groups:
-        raise InputError("--scene is for the group error: aniso-pm bench error --scene FILE")
     wanted = [group for group in GROUPS if group in groups or "all" in groups]
+    if scenes and "error" not in wanted:
+        raise InputError("--scene is for the group error: aniso-pm bench error --scene FILE")
     set_variant(variant)
     for file in scenes or []:
         load(file, {}, 0, needed=False)  # what is wrong with it is said before anything is rendered

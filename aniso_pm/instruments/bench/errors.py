@@ -67,11 +67,9 @@ def measure(
              with ``kernel=isotropic``.
     """
     budgets, seeds = ((1.0,), 3) if quick else (BUDGETS, SEEDS)
+    size = {} if files else _SIZE
     for file in files or [scene.file for scene in gallery.scenes()]:
-        try:
-            yield from _scene(Path(file), list(budgets), seeds, plugins, {} if files else _SIZE)
-        except InputError as error:  # no reference, or of another size
-            yield Row(f"error: {Path(file).stem}", None, "×", None, str(error))
+        yield from _rows("error", Path(file), list(budgets), seeds, plugins, size)
 
 
 def measure_large(quick: bool) -> Iterator[Row]:
@@ -79,14 +77,23 @@ def measure_large(quick: bool) -> Iterator[Row]:
     if quick:
         yield Row("large: path over as installed", None, "×", None, "too slow for --quick")
         return
-    for file in [Path(scene.file) for scene in gallery.scenes()]:
-        try:
-            yield from _scene(file, list(LARGE_BUDGETS), LARGE_SEEDS, {"as installed": {}}, LARGE)
-        except InputError as error:  # no reference of that size
-            yield Row(f"large: {file.stem}", None, "×", None, str(error))
+    for scene in gallery.scenes():
+        plugins: dict[str, dict[str, Any]] = {"as installed": {}}
+        file, budgets = Path(scene.file), list(LARGE_BUDGETS)
+        yield from _rows("large", file, budgets, LARGE_SEEDS, plugins, LARGE)
 
 
-def _scene(file: Path, budgets, seeds: int, plugins, size: dict[str, str]) -> Iterator[Row]:
+def _rows(group: str, file: Path, *given: Any) -> Iterator[Row]:
+    """given: as of ``_scene``. A scene without reference of that size is a row that says so."""
+    try:
+        yield from _scene(group, file, *given)
+    except InputError as error:
+        yield Row(f"{group}: {file.stem}", None, "×", None, str(error))
+
+
+def _scene(
+    group: str, file: Path, budgets, seeds: int, plugins, size: dict[str, str]
+) -> Iterator[Row]:
     world = mi.load_file(str(file), optimize=False, **size)
     sensor = world.sensors()[0]
     found = require_reference(file, world, sensor)
@@ -117,7 +124,6 @@ def _scene(file: Path, budgets, seeds: int, plugins, size: dict[str, str]) -> It
             done[name].append(runs.run(stage, method, None, seed, budgets))
 
     weight = metrics.weights(found.halves)
-    group = "large" if size is LARGE else "error"
     for k, budget in enumerate(budgets):
         for region, mask in masks.items():
             tables = {}
@@ -125,13 +131,20 @@ def _scene(file: Path, budgets, seeds: int, plugins, size: dict[str, str]) -> It
                 images = np.stack([run.images[k] for run in each])
                 tables[name] = metrics.products(images, found.halves, mask, weight)
             for name in plugins:
+                title = f"{group}: {file.stem}, {budget:g} s, {region}: path over {name}"
+                goal = _goal(file.stem, region, name) if size is _SIZE else None
+                late = sum(run.passes[k] == 0 for run in done[name])
+                if late:
+                    note = f"no pass was done in time in {late} of {seeds} runs"
+                    yield Row(title, None, "×", goal, note)
+                    continue
                 images = np.stack([run.images[k] for run in done[name]])
                 ratio = metrics.ratio(tables["path"], tables[name])
                 yield Row(
-                    f"{group}: {file.stem}, {budget:g} s, {region}: path over {name}",
+                    title,
                     ratio.value,
                     "×",
-                    _goal(file.stem, region, name) if size is _SIZE else None,
+                    goal,
                     _note(ratio, tables, name, images, found, mask, weight, done[name], k),
                 )
 
