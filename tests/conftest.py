@@ -113,6 +113,12 @@ def run(tmp_path, capfd, monkeypatch):
 
 
 @pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """A cache of references that neither the user nor another test has written to."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
 def write_scene(tmp_path):
     """Write a scene and return its path."""
 

@@ -158,14 +158,18 @@ def test_scenes_are_for_the_group_error_and_have_to_be_there(capsys, given, said
     assert said in capsys.readouterr().err
 
 
-def test_a_scene_without_reference_is_a_row_that_says_how_to_make_one(write_scene, capsys):
+def test_a_scene_without_reference_is_a_row_that_says_how_to_make_one(
+    own_cache, write_scene, capsys
+):
     scene = write_scene()
     assert cli.main(["bench", "error", "--scene", str(scene), "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["figure"] is None and "aniso-pm reference" in row["note"]
 
 
-def test_a_run_without_a_picture_in_time_is_a_note_and_no_number(write_scene, capsys, monkeypatch):
+def test_a_run_without_a_picture_in_time_is_a_note_and_no_number(
+    own_cache, write_scene, capsys, monkeypatch
+):
     scene = write_scene()
     assert cli.main(["reference", str(scene), "--spp", "16", "--quiet"]) == 0
     run = errors.runs.run

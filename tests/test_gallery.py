@@ -30,9 +30,8 @@ def test_every_scene_says_what_it_is_for():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_copy_of_each_scene_finds_its_reference(name, tmp_path, monkeypatch, variant_llvm_rgb):
+def test_a_copy_of_each_scene_finds_its_reference(name, tmp_path, own_cache, variant_llvm_rgb):
     """Wherever it is copied to; and whoever changes a scene has to make its reference again."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     gallery.copy(tmp_path / "copy")
     file = tmp_path / "copy" / f"{name}.xml"
     world = mi.load_file(str(file), optimize=False, **SMALL.get(name, {}))

@@ -47,8 +47,7 @@ def _variant(variant_llvm_rgb):
 
 
 @pytest.fixture
-def scene_file(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def scene_file(tmp_path, own_cache):
     path = tmp_path / "room.xml"
     path.write_text(SCENE)
     return path
