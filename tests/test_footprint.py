@@ -109,7 +109,8 @@ def test_cameras_side_by_side_have_pixels_as_wide_as_one_alone(variant_llvm_rgb)
 
 
 def test_sensors_whose_pixels_have_no_width_have_one_radius(variant_llvm_rgb):
-    """The kernels of a radiance meter's passes are as wide as their radius says."""
+    """The kernels of a radiance meter's passes are as wide as their radius says, which goes with
+    the number of light paths, and these are not millions for a few hundred eye paths."""
     film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
     meter = {"type": "radiancemeter", "origin": [0, 0, 0.9], "direction": [0.2, -0.6, -1]}
     definition = room(size=4) | {"sensor": meter | {"film": film}}
@@ -118,6 +119,7 @@ def test_sensors_whose_pixels_have_no_width_have_one_radius(variant_llvm_rgb):
     plugin = mi.load_dict({"type": "aniso_pm", "map": "global", "passes": 8})
     image = np.array(mi.render(scene, integrator=plugin, spp=512))
     found = plugin.statistics
-    assert found["photons_gathered"] > 10 * found["gather_points"]
+    assert found["photons_emitted"] < 8 * 250_000
+    assert found["photons_gathered"] > 30 * found["gather_points"]
     path = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=4096))
     np.testing.assert_allclose(image.mean(), path.mean(), rtol=0.1)

@@ -233,6 +233,19 @@ def test_path_tracing_has_found_caustics_by_many_hits_or_where_there_are_next_to
     assert not survey._has_found(0 * many, 5e-3 * there, weight)
 
 
+def test_several_pairs_stand_for_each_pixel_of_a_small_film(variant_llvm_rgb):
+    film = {"type": "hdrfilm", "width": 5, "height": 3, "rfilter": {"type": "box"}}
+    sensor = mi.load_dict({"type": "perspective", "film": film})
+    tiles = Tiles.of(sensor, COARSE)
+    assert tiles.across * tiles.down >= 256 and tiles.edge == 1
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, tiles.lanes)
+    x, y = tiles.positions(sensor, 0, sampler).numpy().reshape(2, -1)[:, :: 2 * SAMPLES]
+    there = np.floor(y) * 5 + np.floor(x)  # the pixel of each pair
+    np.testing.assert_array_equal(tiles.to_pixels(there), np.arange(15))
+    np.testing.assert_array_equal(tiles.refined(there, Tiles.of(sensor, 20_000)), there)
+
+
 def test_a_film_of_one_pixel_has_nothing_to_tell_apart(variant_llvm_rgb):
     tiles = Tiles(1, 1, 1)
     with warnings.catch_warnings():

@@ -109,11 +109,12 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
         else EMPTY
         for k in (0, 1)
     ]
+    tried = radius
     if not radius and maps[0].stored and footprint.of(sensor, 1.0) is None:
         # Nothing says how wide pixels are: one radius for all.
         usual = scene.with_(photon_count=count or USUAL)
-        radius = automatic_radius(usual, camera_rays(sensor, seed), seed, maps[0])
-    found = survey.look(scene, sensor, radius or None, seed, each, exactly, maps, count)
+        tried = automatic_radius(usual, camera_rays(sensor, seed), seed, maps[0])
+    found = survey.look(scene, sensor, tried or None, seed, each, exactly, maps, count)
     count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
     # Aimed photons are closer together where they show.
     worth = count / found.aim.variance if found.aim else count

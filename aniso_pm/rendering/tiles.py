@@ -17,6 +17,8 @@ from .prepared import PILOT, PILOT_PIXELS, stream_seed
 # Tiles of a picture at most: those that read the photon map, and those that see what eye paths
 # find by themselves; stratified samples of each half of the pair in a tile's pixel.
 COARSE, FINE, SAMPLES = 4096, 20_000, 4
+# Pairs of smaller films: a single one tells nothing.
+_FEWEST = 256
 # A tile's numbers count by so much, the rest is the picture's mean.
 _TRUST = 0.85
 # Uneven samples have to promise so much less work for the same error: they are a tenth slower.
@@ -25,24 +27,27 @@ _WORTH = 1.1
 
 @dataclass(frozen=True)
 class Tiles:
-    """Squares of ``edge`` pixels that cover a film, with a random pixel and its pair in each."""
+    """Squares of ``edge`` pixels that cover a film, with a random pixel and its pair in each. Where
+    pixels are few, ``split`` × ``split`` tiles, hence pairs, stand for the same one."""
 
     edge: int
     width: int
     height: int
+    split: int = 1
 
     @staticmethod
     def of(sensor, most: int) -> Tiles:
         width, height = sampled_size(sensor.film())
-        return Tiles(max(1, math.ceil(math.sqrt(width * height / most))), width, height)
+        edge = max(1, math.ceil(math.sqrt(width * height / most)))
+        return Tiles(edge, width, height, math.ceil(math.sqrt(_FEWEST / (width * height))))
 
     @property
     def across(self) -> int:
-        return -(-self.width // self.edge)
+        return -(-self.width // self.edge) * self.split
 
     @property
     def down(self) -> int:
-        return -(-self.height // self.edge)
+        return -(-self.height // self.edge) * self.split
 
     @property
     def lanes(self) -> int:
@@ -57,8 +62,9 @@ class Tiles:
         film = sensor.film()
         tile = dr.arange(mi.UInt32, self.lanes) // (2 * SAMPLES)
         a, b = mi.sample_tea_32(tile, dr.opaque(mi.UInt32, stream_seed(seed, PILOT, PILOT_PIXELS)))
-        x = dr.minimum((tile % self.across) * self.edge + a % self.edge, self.width - 1)
-        y = dr.minimum((tile // self.across) * self.edge + b % self.edge, self.height - 1)
+        column, row = tile % self.across // self.split, tile // self.across // self.split
+        x = dr.minimum(column * self.edge + a % self.edge, self.width - 1)
+        y = dr.minimum(row * self.edge + b % self.edge, self.height - 1)
         # Unsigned numbers, which have no place left of the first pixel.
         corner = mi.ScalarPoint2f(film.crop_offset()) - border(film)
         return mi.Point2f(mi.Float(x), mi.Float(y)) + corner + sampler.next_2d()
@@ -102,12 +108,14 @@ class Tiles:
         return 0.5 * np.sqrt(squared * _SQUARED_WEIGHTS)
 
     def refined(self, pairs, finer: Tiles) -> np.ndarray:
-        """Values of pairs for the tiles of ``finer``, which are smaller."""
+        """Values of pairs for the tiles of ``finer``, which are smaller, or split as these."""
         row = np.arange(finer.down) * finer.edge // self.edge
         column = np.arange(finer.across) * finer.edge // self.edge
         return self.grid(pairs)[np.ix_(row, column)].ravel()
 
     def to_pixels(self, tiles) -> np.ndarray:
+        k = self.split
+        tiles = tiles.reshape(self.down // k, k, self.across // k, k).mean((1, 3))
         pixels = np.kron(tiles, np.ones((self.edge, self.edge)))
         return pixels[: self.height, : self.width].ravel()
 
