@@ -1,4 +1,4 @@
-"""NumPy arrays into Dr.Jit's memory."""
+"""Numbers and NumPy arrays into Dr.Jit's memory."""
 
 from __future__ import annotations
 
@@ -26,3 +26,9 @@ def own(kind, values: np.ndarray):
     array = kind(padded) + dr.opaque(kind, 0)
     dr.eval(array)
     return dr.reshape(kind, array, count, shrink=True)
+
+
+def number(kind, value):
+    """A number as an array that is no literal: as a literal it would be compiled into kernels, a
+    new one for every value. Arrays stay what they are."""
+    return kind(value) if dr.is_array_v(value) else dr.opaque(kind, value)

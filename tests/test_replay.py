@@ -55,7 +55,7 @@ def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
     def fail(*arguments):
         raise RuntimeError("cannot be recorded")
 
-    monkeypatch.setattr(dr, "freeze", lambda function: fail)
+    monkeypatch.setattr(dr, "freeze", lambda function, **options: fail)
     scene = load()
     plugin = integrator(passes=3)
     image = render(scene, plugin, 6)

@@ -11,6 +11,7 @@ import pytest
 from aniso_pm.instruments import gallery
 from aniso_pm.map.photon_map import photon_flux, thinned
 from aniso_pm.rendering import pilot, plan, survey
+from aniso_pm.rendering.decisions import WORTH_FOLLOWING
 from aniso_pm.rendering.film import border
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
@@ -66,7 +67,7 @@ def test_lobes_are_followed_where_kernels_behind_them_matter(variant_llvm_rgb):
     wall = mi.load_file(str(gallery.directory() / "brushed_wall.xml"), width="80", height="60")
     near = mi.load_dict(room_with_plate(size=24))
     assert follows(wall) and not follows(near)
-    assert 0 <= found[near].lobes < 0.1 < pilot.WORTH_FOLLOWING < found[wall].lobes <= 1
+    assert 0 <= found[near].lobes < 0.1 < WORTH_FOLLOWING < found[wall].lobes <= 1
     for asked in ({"kernel": "anisotropic"}, {"photon_count": 10**5}, {"initial_radius": 0.05}):
         assert follows(near, map="global", **asked), asked
     assert not follows(wall, kernel="isotropic")

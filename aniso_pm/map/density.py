@@ -28,6 +28,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import number
 from ..kernel import PlaneKernel, disc, guarded_axes
 from ..lobe_path import LobeOnPath
 from . import index as spatial
@@ -177,8 +178,7 @@ def estimate(
         whole = 0.5 * tolerance, math.exp(-CUT2), visit_node
     total = (mi.Spectrum(0), mi.Spectrum(0), mi.UInt32(0))
     area = dr.pi * dr.sqrt(dr.squared_norm(kernel.s)) * dr.sqrt(dr.squared_norm(kernel.t))
-    # As a literal, their number would be compiled into the kernel.
-    unit = dr.rcp(area * KERNEL_MASS * dr.opaque(mi.Float, photons.emitted))
+    unit = dr.rcp(area * KERNEL_MASS * number(mi.Float, photons.emitted))
     reflected, _, count = spatial.gather(photons.index, ellipses, CUT2, visit, total, active, whole)
     return points.weight * reflected * unit, count
 
@@ -271,7 +271,7 @@ def probe_surface(
     n = mi.Vector3f(points.n)
     height, rounding = SLAB * thickness, _rounding(points.p)
     # Random numbers of the eye path and vertex, whatever the order of the points.
-    state, sequence = mi.sample_tea_32(points.lane, points.depth + dr.opaque(mi.UInt32, seed))
+    state, sequence = mi.sample_tea_32(points.lane, points.depth + number(mi.UInt32, seed))
     random = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
     tries = mi.UInt32(0)
     landed = mi.Bool(False)

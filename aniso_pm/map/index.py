@@ -23,6 +23,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import number
+
 LEAF = 8
 _BITS = 21
 # Leaves that a lane finds before it goes through their points. One more entry is a waste bin; with
@@ -65,25 +67,25 @@ class Ellipses:
 class Index:
     """Hierarchy over ``count`` points.
 
+    count, n_leaves  int, or as arrays (``number``) where functions are frozen.
     points  x, y, z and the caller's 32-bit word of each slot, interleaved; not a number in the
             slots that fill up the last leaf.
     boxes   lower corner and size (see ``_pack``) of each node, interleaved, in heap order.
     extent  the longest side of all points together, the unit of the sizes.
     """
 
-    count: int
-    n_leaves: int
+    count: Any
+    n_leaves: Any
     points: Any
     boxes: Any
     extent: Any
 
     def points_in(self, node, active):
         """Number of points below a node; 0 where it is not active."""
-        n_leaves, count = dr.opaque(mi.UInt32, self.n_leaves), dr.opaque(mi.UInt32, self.count)
+        n_leaves, count = number(mi.UInt32, self.n_leaves), number(mi.UInt32, self.count)
         height = dr.lzcnt(node) - dr.lzcnt(n_leaves)
         first = LEAF * ((node << height) - n_leaves)
-        number = dr.minimum(LEAF << height, count - first)
-        return dr.select(active, number, 0)
+        return dr.select(active, dr.minimum(LEAF << height, count - first), 0)
 
 
 def curve_order(positions):
@@ -274,7 +276,7 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, 
     other once for some fifteen leaves, not for each.
     """
     center, a, b, c = ellipses.center, ellipses.a, ellipses.b, ellipses.c
-    n_leaves = dr.opaque(mi.UInt32, index.n_leaves)
+    n_leaves = number(mi.UInt32, index.n_leaves)
     points, boxes = index.points, index.boxes
     half_extent, reach = 0.5 * index.extent, mi.Vector3f(ellipses.reach(cut2))
     abs_a, abs_b, abs_c = dr.abs(a), dr.abs(b), dr.abs(c)

@@ -44,6 +44,20 @@ class PhotonMap:
     sums: Any = None
     origins: Origins | None = None
 
+    def numbered(self) -> PhotonMap:
+        """The same for gathering: what differs from map to map as arrays, which are no part of what
+        is traced, and the rest left out."""
+        index = self.index
+        count, leaves = (dr.opaque(mi.UInt32, v) for v in (index.count, index.n_leaves))
+        return replace(
+            self,
+            emitted=dr.opaque(mi.UInt32, self.emitted),
+            stored=0,
+            rejected=0,
+            index=replace(index, count=count, n_leaves=leaves),
+            origins=None,
+        )
+
 
 @dataclass(frozen=True)
 class Origins:

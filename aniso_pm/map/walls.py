@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import number
 from ..kernel import PlaneKernel
 from .photon_word import NORMAL_COS
 
@@ -44,7 +45,7 @@ def nearest(scene, seed: int, points, kernel: PlaneKernel, reach: float, lift, p
     passes  a function of (mi.BSDFPtr, active): does light pass? None where none does.
     """
     n = mi.Vector3f(points.n)
-    state, sequence = mi.sample_tea_32(points.lane, points.depth + dr.opaque(mi.UInt32, seed))
+    state, sequence = mi.sample_tea_32(points.lane, points.depth + number(mi.UInt32, seed))
     random = mi.PCG32(1, mi.UInt64(sequence), mi.UInt64(state))
     first = random.next_float32()
     found, c, farthest = mi.Vector3f(0), mi.Float(0), mi.Float(1)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import own
+from ..errors import is_interrupt, one_line
 from . import advice, digest, footprint, memory
 from . import film as films
 from .allotment import Allotment
@@ -106,7 +107,7 @@ def decide(
     # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
     exactly = known.get(digest.SAMPLES)
     each = exactly or share.each
-    settled = controls.settled or settle(scene, sensor, seed, each, bool(exactly))
+    scene, settled = _settle(scene, sensor, seed, each, bool(exactly), controls.settled)
     settled = replace(
         settled,
         use=known.get(digest.USE) or settled.use,
@@ -129,10 +130,26 @@ def decide(
     gathering = None
     if settled.share.min() < 1:
         gathering = own(mi.Float, np.resize(settled.share, pixels).astype(np.float32))
-    # The response curves of a specfilm do not survive a replay of the scene that they are in.
-    replayed = settings.passes != 1 and not mi.has_flag(film.flags(), mi.FilmFlags.Special)
+    replayed = settings.passes != 1 and scene.replays
     allotment = Allotment(pixels, settled.each, settled.counts)
     return Decided(scene, settled, share, allotment, gathering, layered, plan, variance, replayed)
+
+
+def _settle(
+    scene: Prepared, sensor, seed: int, each: int, exactly: bool, known: Settled | None
+) -> tuple[Prepared, Settled]:
+    """(the scene, frozen if it can be, what is chosen). known: by somebody else."""
+    # The response curves of a specfilm do not survive a replay of the scene that they are in.
+    if not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
+        frozen = scene.frozen()
+        try:
+            return frozen, known or settle(frozen, sensor, seed, each, exactly)
+        except RuntimeError as error:
+            # Dr.Jit cannot record every scene (materials written in Python, for example).
+            if is_interrupt(error):
+                raise
+            mi.Log(mi.LogLevel.Debug, f"aniso_pm: nothing is replayed: {one_line(error)}")
+    return scene, known or settle(scene, sensor, seed, each, exactly)
 
 
 def _job(

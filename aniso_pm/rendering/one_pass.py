@@ -50,7 +50,7 @@ class Tracer:
     def __init__(self, decided: Decided, sensor, seed: int, clock: Clock):
         self.decided, self.sensor, self.seed, self.clock = decided, sensor, seed, clock
         self.replayed = decided.replayed
-        self.scene = decided.scene.frozen() if self.replayed else decided.scene
+        self.scene = decided.scene if self.replayed else decided.scene.thawed()
         self.map: PhotonMap | None = None
         self.radius: float | None = None
         self.unfinished: Traced | None = None
@@ -66,7 +66,7 @@ class Tracer:
         try:
             return self._trace(index, report)
         except RuntimeError as error:
-            # Dr.Jit cannot record every scene (materials written in Python, for example).
+            # As in the pilot, which does not record everything (see ``beginning``).
             if is_interrupt(error) or not self.replayed:
                 raise
             mi.Log(mi.LogLevel.Debug, f"aniso_pm: passes are not replayed: {one_line(error)}")

@@ -31,10 +31,6 @@ PHOTONS_PER_KERNEL = 60
 FEWEST, MOST = 10_000, 5_000_000
 # Light paths and eye paths of the pilot, and photons that a disc must hold to be measured.
 _PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
-# Lobes are followed where kernels behind them make so much of the error. They cost up to a seventh
-# of the time; where half of the error was theirs following them has saved a third of it, and less
-# than its cost where a fifth to three tenths were (docs/performance.md).
-WORTH_FOLLOWING = 1 / 3
 # Light paths for which the bandwidth is chosen before their number is.
 USUAL = 250_000
 # Range of radii as shares of the scene's extent: 1.2e-5 · 2^13 = 0.1.
@@ -83,7 +79,7 @@ class Settled:
     def applied(self, scene: Prepared) -> Prepared:
         """The scene with the use of its map, with or without lobes, and with the number and aim of
         light paths."""
-        matter = self.lobes >= WORTH_FOLLOWING or not scene.lobes_are_dispensable
+        matter = scene.worth_following(self.lobes)
         aimed = self.aim.aim() if self.aim else None
         scene = scene.focused(self.focus)
         scene = replace(scene, chosen=self.use, aim=aimed, lobes_matter=matter)
@@ -129,7 +125,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
         counts=found.counts,
         widths=found.widths,
         aim=found.aim,
-        lobes=round(found.lobes, 2),
+        lobes=found.lobes,
         focus=focus if found.use != "none" else None,
     )
 

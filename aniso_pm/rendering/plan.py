@@ -229,7 +229,7 @@ class Plan:
             gathered=found.light.mean(1),
             noise=(noise.gather + noise.alone * thinner) / (filtered * share),
             aim=found.aim,
-            lobes=behind / max(error, 1e-30),
+            lobes=round(behind / max(error, 1e-30), 2),
         )
 
 

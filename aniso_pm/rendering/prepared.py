@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,19 +12,19 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import Unsupported
-from ..map import density, summed, walls
+from ..map import density, summed
 from ..map.gather_points import GatherPoints, map_tree, take
 from ..map.photon_map import EMPTY, PhotonMap
-from ..map.receivers import read_cover
 from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
 from ..transport.amends import repair_bounds
 from ..transport.focus import Focus
-from ..transport.gathered_layers import split
 from ..transport.thinning import Thinning
 from ..transport.walk import WalkOptions
+from . import gathering
 from .decisions import Decisions
-from .footprint import TRIED, Footprint
+from .footprint import Footprint
+from .gathering import GatherOptions
 from .needs import read_scene
 from .settings import Settings
 
@@ -58,10 +57,11 @@ class Radiance:
 
 @dataclass(frozen=True)
 class Launch:
-    """The two functions that take most time to trace; frozen, they are traced once and replayed."""
+    """The functions that take most time to trace; frozen, they are traced once and replayed."""
 
     light: Callable = photons.light_paths
     eye: Callable = eye.eye_paths
+    gather: Callable = gathering.gather
 
 
 @dataclass(frozen=True)
@@ -83,18 +83,25 @@ class Prepared(Decisions):
             return self
         return replace(self, focus=focus, emission=self.emission.focused(focus))
 
+    @property
+    def replays(self) -> bool:
+        """Is it frozen?"""
+        return self.launch != Launch()
+
     def thawed(self) -> Prepared:
         """The same scene with nothing frozen."""
         return replace(self, launch=Launch())
 
     def frozen(self) -> Prepared:
-        """The same scene for many passes: paths are traced in Python once and then replayed."""
+        """The same scene for a pilot and many passes: stages are traced in Python once and then
+        replayed."""
         # Scenes that nobody uses any more must not vanish while Dr.Jit records this one: their
         # materials are part of the same virtual function calls.
         gc.collect()
-        return replace(
-            self, launch=Launch(dr.freeze(photons.light_paths), dr.freeze(eye.eye_paths))
-        )
+        # A pilot asks for more kinds of gathers than Dr.Jit finds normal.
+        freeze = partial(dr.freeze, warn_after=1000)
+        stages = photons.light_paths, eye.eye_paths, gathering.gather
+        return replace(self, launch=Launch(*map(freeze, stages)))
 
     def photon_map(
         self,
@@ -167,8 +174,8 @@ class Prepared(Decisions):
             surface=for_layers and self.surface_layers,
         )
         launch = self.launch.eye
-        if watch:
-            launch = lambda *wavefront: self.launch.eye(*wavefront, see=watch())  # noqa: E731
+        if watch:  # what watches cannot be frozen
+            launch = lambda *wavefront: eye.eye_paths(*wavefront, see=watch())  # type: ignore[misc]  # noqa: E731
         return eye.trace(self.scene, sampler, ray, options, expected, launch)
 
     def gather(
@@ -190,102 +197,44 @@ class Prepared(Decisions):
                      path (see ``density.estimate``).
         for_layers   find what layers need that are asked for.
         """
-        if points.lambertian is None:
-            return [self._gather(map_, radius, seed, points, None, scores, for_layers)]
-        parts = []
-        for general in (False, True):
-            index = dr.compress(points.lambertian != general)
-            if dr.width(index):
-                some = take(points, index)
-                surface = None
-                if general:
-                    roughness = self.settings.gather_roughness
-                    surface = density.Surface.at(self.scene, some, roughness, wavelengths)
-                parts.append(self._gather(map_, radius, seed, some, surface, scores, for_layers))
-        return parts
-
-    def bandwidth(self, points: GatherPoints, radius):
-        """Of each gather point, world units. radius: of the pass."""
-        if self.footprint is None:
-            return radius
-        return radius * self.footprint.share(points.distance, points.lane)
-
-    def thickness(self, points: GatherPoints, radius):
-        """Bandwidth by which photons are on the same surface (``density.SLAB``): that of kernels
-        as wide as pilots try them, where they are wider. Farther off lies who knows what."""
-        if self.footprint is None:
-            return radius
-        return radius * self.footprint.share(points.distance, points.lane, TRIED)
-
-    def walled(self, points: GatherPoints, kernel, thickness, seed: int) -> GatherPoints:
-        """The same points with the walls beside them, where edges are compensated."""
-        if not self.settings.edge_compensation:
-            return points
-        cover = self._cover
-        wall = walls.nearest(
-            self.scene,
-            seed,
-            points,
-            kernel,
-            math.sqrt(density.CUT2),
-            0.5 * density.SLAB * thickness,
-            (lambda bsdf, active: cover(bsdf, active)[1]) if cover else None,
-        )
-        return replace(points, wall=wall)
-
-    @property
-    def _cover(self):
-        """A function as ``receivers.read_cover``; None where every surface gathers and none lets
-        light pass."""
-        return partial(read_cover, receivers=self.needs.receiving) if self.deep else None
-
-    def _gather(self, map_, radius, seed, points, surface, scores, for_layers) -> density.Gathered:
-        if scores is not None:
-            scores = scores[0], dr.gather(mi.Float, scores[1], points.lane)
-        thickness = self.thickness(points, radius)
-        radius = self.bandwidth(points, radius)
-        kernel, follows, degenerate = density.kernels(points, radius, self.kernel_options)
-        points = self.walled(points, kernel, thickness, seed)
-        L, count = density.estimate(
-            map_,
-            points,
-            kernel,
-            thickness,
-            self.gather_depth,
-            mi.Bool(True),
-            surface,
-            self.settings.gather_tolerance,
-            scores,
-        )
-        light: Any = None
-        if for_layers and self.light_layers:
-            light = split(
-                L,
-                self.use,
-                bool(self.needs.unseen),
-                map_,
-                points,
-                kernel,
-                thickness,
-                self.gather_depth,
-                surface,
-                self.settings.gather_tolerance,
-            )
-        lost = mi.Bool(False)
-        if self.settings.edge_compensation:
-            inverse, lost = density.probe_surface(
-                self.scene, seed, points, kernel, thickness, count > 0, self._cover
-            )
-            L *= inverse
-            light = map_tree(lambda part: part * inverse, light)
-        clamped, capped = follows & kernel.clamped, follows & kernel.capped
-        found = density.Gathered(points.lane, L, count, follows, clamped, capped, degenerate, lost)
+        o = self.gather_options
         if for_layers:
             wanted = "radius" in self.settings.layer_names
-            found = replace(found, light=light, radius=mi.Float(radius) if wanted else None)
-        # One kernel for all of it: a reduction by itself would run the whole gather again.
-        dr.eval(found)
-        return found
+            o = replace(o, light=self.light_layers, radius=wanted)
+        map_, seed = map_.numbered(), dr.opaque(mi.UInt32, seed)
+
+        def gather(some, roughness=None):
+            options = replace(o, roughness=roughness)
+            found = self.launch.gather(
+                self.scene, map_, radius, seed, some, self.footprint, wavelengths, scores, options
+            )
+            # One kernel for all of it: a reduction by itself would run the whole gather again.
+            dr.eval(found)
+            return found
+
+        if points.lambertian is None:
+            return [gather(points)]
+        parts = []
+        for roughness in (None, self.settings.gather_roughness):
+            index = dr.compress(points.lambertian == (roughness is None))
+            if dr.width(index):
+                parts.append(gather(take(points, index), roughness))
+        return parts
+
+    @property
+    def gather_options(self) -> GatherOptions:
+        """For gather points on Lambertian receivers, without layers."""
+        s = self.settings
+        return GatherOptions(
+            kernel=self.kernel_options,
+            max_depth=self.gather_depth,
+            compensate=s.edge_compensation,
+            receiving=tuple(sorted(self.needs.receiving)) if self.deep else None,
+            roughness=None,
+            tolerance=s.gather_tolerance,
+            use=self.use,
+            unseen=bool(self.needs.unseen),
+        )
 
     def radiance(
         self,

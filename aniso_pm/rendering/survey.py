@@ -209,11 +209,12 @@ def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray |
     if plan.each < FEW:
         return None
     fine, coarse = Tiles.of(sensor, FINE), plan.tiles
-    sampler, ray, lane = _pairs(sensor, fine, seed, PILOT_FINE)
-    # Kernels as those of the passes, which leave gather points.
-    scene = replace(scene, chosen=plan.use, footprint=footprint.of(sensor, 1.0))
-    few = dr.full(mi.Float, LEAST_SHARE, fine.lanes)
-    thinning = Thinning.of(few, seed, lane, lane) if plan.share.min() < 1 else None
+    sampler, ray, pixel, sample = _pairs(sensor, fine, seed, PILOT_FINE)
+    # Traced as in the passes, by the same compiled kernel.
+    scene = replace(scene, chosen=plan.use, lobes_matter=scene.worth_following(plan.lobes))
+    scene = replace(scene, footprint=footprint.of(sensor, 1.0))
+    few = dr.opaque(mi.Float, LEAST_SHARE, fine.lanes // SAMPLES)
+    thinning = Thinning.of(few, seed, pixel, sample) if plan.share.min() < 1 else None
     L, _, _ = scene.trace(sampler, ray, thinning=thinning)
     own = _pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
     weight = fine.weight(own + coarse.refined(plan.gathered, fine)[:, None])
@@ -223,12 +224,13 @@ def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray |
 
 
 def _pairs(sensor, tiles: Tiles, seed: int, stream: int):
-    """(sampler, rays, lanes) of the pairs of all tiles."""
+    """(sampler, rays, half of a pair as a pixel of its own, sample in it) of all tiles' pairs."""
     sampler = mi.load_dict({"type": "owen_sobol"})
     lane = dr.arange(mi.UInt32, tiles.lanes)
-    sampler.begin(stream_seed(seed, PILOT, stream), lane // SAMPLES, lane % SAMPLES)
+    pixel, sample = lane // SAMPLES, lane % SAMPLES
+    sampler.begin(stream_seed(seed, PILOT, stream), pixel, sample)
     ray, _ = rays_through(sensor, sampler, tiles.positions(sensor, seed, sampler), 0.5)
-    return sampler, ray, lane
+    return sampler, ray, pixel, sample
 
 
 @dataclass(frozen=True)
@@ -251,7 +253,7 @@ class _Seen:
 
 
 def _trace(scene: Prepared, sensor, tiles: Tiles, seed: int) -> _Seen:
-    sampler, ray, _ = _pairs(sensor, tiles, seed, PILOT_PAIRS)
+    sampler, ray, _, _ = _pairs(sensor, tiles, seed, PILOT_PAIRS)
     scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
     vertices = early = mi.Float(0)
 

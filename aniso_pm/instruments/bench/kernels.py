@@ -13,7 +13,8 @@ from .row import Row
 
 
 def hashes(scene, kernel: str) -> set[str]:
-    """Of all kernels of a small rendering of the scene."""
+    """Of all kernels of a small rendering of the scene, the second: what is replayed turns numbers
+    of a scene into arrays, which later renderings find."""
     integrator = {
         "type": "aniso_pm",
         "map": "global",
@@ -22,6 +23,7 @@ def hashes(scene, kernel: str) -> set[str]:
         "initial_radius": 0.1,
     }
     integrator = mi.load_dict(integrator)
+    dr.eval(mi.render(scene, integrator=integrator, spp=1))
     with recorded() as records:
         dr.eval(mi.render(scene, integrator=integrator, spp=1))
         return {k["hash"] for k in records()}

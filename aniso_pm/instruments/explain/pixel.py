@@ -13,7 +13,7 @@ from ...kernel import kernel_axes, project_to_plane
 from ...map import density
 from ...map.gather_points import take
 from ...ndf import read_roughness
-from ...rendering import film, footprint
+from ...rendering import film, footprint, gathering
 from ...rendering.needs import describe, surfaces
 from ...rendering.pilot import settle
 from ...rendering.prepared import EYE, PROBE, Prepared, prepare, stream_seed
@@ -148,8 +148,8 @@ def explain(
         path = vertices.path(sample, scene, ())
         return replace(found, sentence=f"eye path {sample} reads no photon map", path=path)
     point = take(points, mi.UInt32(chosen))
-    thickness = float(dr.mean(prepared.thickness(point, mi.Float(radius)))[0])
-    radius = float(dr.mean(prepared.bandwidth(point, mi.Float(radius)))[0])
+    thickness = float(dr.mean(gathering.thickness(point, mi.Float(radius), prepared.footprint))[0])
+    radius = float(dr.mean(gathering.bandwidth(point, mi.Float(radius), prepared.footprint))[0])
     found = replace(found, radius=radius)
     kernel, lobe, outlines = _kernel(prepared, point, radius, bool(lost[chosen]))
     lane = int(lanes[chosen])
@@ -360,7 +360,8 @@ def _photons(
 ) -> Photons:
     """Photons in a window around the kernel. seed: of density estimation."""
     plane, _, _ = density.kernels(point, mi.Float(radius), prepared.kernel_options)
-    point = prepared.walled(point, plane, mi.Float(thickness), seed)
+    options, thick = prepared.gather_options, mi.Float(thickness)
+    point = gathering.walled(prepared.scene, point, plane, thick, seed, options)
     limit = prepared.gather_depth
     counted = density.photons_inside(map_, point, plane, mi.Float(thickness), limit).numpy()
     at = dr.gather(mi.Vector4f, map_.index.points, dr.arange(mi.UInt32, map_.stored))
