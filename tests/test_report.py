@@ -71,7 +71,7 @@ SCENE = """<scene version="3.0.0">
 </scene>
 """
 QUICK = ("--quick", "--time", "1", "--photons", "3000", "--spp", "1")
-BRIEF = (*QUICK, "--time", "0.25")  # by the clock that ticks
+BRIEF = (*QUICK, "--time", "0.12")  # by the clock that ticks
 
 
 @pytest.fixture(autouse=True)

@@ -45,7 +45,7 @@ def test_a_dark_method_shows_in_energy_and_bias(small_room, monkeypatch, ticking
     monkeypatch.setattr(density, "estimate", darker)
     (method,) = methods.parse("isotropic/default")
     stage = stage_of(world)
-    images = np.array([runs.run(stage, method, 0.1, seed, [1.0]).images[0] for seed in range(4)])
+    images = np.array([runs.run(stage, method, 0.1, seed, [0.4]).images[0] for seed in range(4)])
     weight = metrics.weights(ref.halves)
     mask = np.ones(weight.shape[:2], bool)
     energy = metrics.energy(images, ref.halves, mask)
@@ -96,10 +96,10 @@ def test_pictures_are_snapshots_of_one_run(ticking):
         (method,) = methods.parse(name)
         stage = stage_of(world, 2000)
         runs.warm_up(stage, method, 0.1, 9)
-        found = runs.run(stage, method, 0.1, 0, [1e-6, 0.3, 0.6])
+        found = runs.run(stage, method, 0.1, 0, [1e-6, 0.1, 0.2])
         assert found.passes[0] == 0 and np.isnan(found.images[0]).all()
         assert 0 < found.passes[1] < found.passes[2] and found.spp[1] < found.spp[2]
-        assert found.seconds[1] <= 0.3 < found.seconds[2] <= 0.6
+        assert found.seconds[1] <= 0.1 < found.seconds[2] <= 0.2
         assert np.isfinite(found.images[1:]).all()
 
 
