@@ -23,6 +23,12 @@ if not (Path(__file__).parent / "plugins").is_dir():
 _llvm.prepare()
 
 # Dr.Jit must load after LLVM.
+import drjit  # noqa: E402
+
+# With a single thread, as on a single core, Mitsuba waits for ever where it reads or writes EXR.
+if drjit.thread_count() < 2:
+    drjit.set_thread_count(2)
+
 from aniso_pm import asg, kernel, ndf, plugins, warp  # noqa: E402
 from aniso_pm.pictures.denoising import denoise  # noqa: E402
 from aniso_pm.rendering import progress, state  # noqa: E402

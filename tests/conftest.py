@@ -2,24 +2,24 @@
 program `aniso-pm`."""
 
 import aniso_pm  # noqa: F401  (before drjit, so that it can choose LLVM)  # isort: skip
-import os
+import gc
 import time
 
 import command_line
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm import cli
 from aniso_pm.rendering.pilot import Settled
 
-# Tests that run side by side share the cores: threads that wait for each other take several times
-# as long.
-_SIDE_BY_SIDE = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-if _SIDE_BY_SIDE > 1:
-    dr.set_thread_count(max(1, (os.cpu_count() or 1) // _SIDE_BY_SIDE))
-
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral")
+
+
+def pytest_collection_finish():
+    """Renderings look for scenes that nobody uses any more, and need not look through all that
+    tests have imported."""
+    gc.collect()
+    gc.freeze()
 
 
 def _use(variant):

@@ -107,6 +107,24 @@ def test_importing_loads_nothing_slow(tmp_path):
     assert run_python(code, tmp_path).stdout.strip() == "[]"
 
 
+ON_ONE_CORE = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import aniso_pm, mitsuba as mi, numpy as np
+mi.set_variant("llvm_ad_rgb")
+mi.Bitmap(np.ones((40, 30, 3), np.float32)).write("one.exr")
+print(np.array(mi.Bitmap("one.exr")).shape)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
+def test_pictures_are_written_and_read_on_a_single_core(tmp_path):
+    """Mitsuba alone waits there for ever."""
+    run = run_python(ON_ONE_CORE, tmp_path, seconds=60)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip() == "(40, 30, 3)"
+
+
 def test_reloading_as_mitsuba_3_10_does_registers_once(tmp_path):
     code = (
         "import aniso_pm, importlib, mitsuba as mi\n"
