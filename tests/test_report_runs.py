@@ -45,7 +45,7 @@ def test_a_dark_method_shows_in_energy_and_bias(small_room, monkeypatch, ticking
     monkeypatch.setattr(density, "estimate", darker)
     (method,) = methods.parse("isotropic/default")
     stage = stage_of(world)
-    images = np.array([runs.run(stage, method, 0.1, seed, [0.4]).images[0] for seed in range(4)])
+    images = np.array([runs.run(stage, method, 0.1, seed, [0.2]).images[0] for seed in range(4)])
     weight = metrics.weights(ref.halves)
     mask = np.ones(weight.shape[:2], bool)
     energy = metrics.energy(images, ref.halves, mask)
@@ -69,10 +69,10 @@ def test_looking_at_pictures_does_not_cost_time(monkeypatch, ticking):
         ticking(0.2)
         return add(*arguments)
 
-    swift = runs.run(stage, method, 0.1, 1, [0.3, 0.6])
+    swift = runs.run(stage, method, 0.1, 1, [0.15, 0.3])
     monkeypatch.setattr(runs._Recorder, "add", slow)
-    found = runs.run(stage, method, 0.1, 1, [0.3, 0.6])
-    # With 200 ms more a pass there would be 3 of them.
+    found = runs.run(stage, method, 0.1, 1, [0.15, 0.3])
+    # With 200 ms more a pass there would be 2 of them.
     assert found.passes == swift.passes and found.passes[1] > 10
     assert sum(found.stages.values()) == pytest.approx(found.seconds[1])
 
