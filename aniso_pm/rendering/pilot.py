@@ -163,7 +163,9 @@ def _weighted_median(radii) -> float:
 
 def photons_per_path(scene: Prepared, seed: int) -> float:
     """Photons that a light path leaves in the mean."""
-    map_ = scene.with_(photon_count=_PATHS).photon_map(stream_seed(seed, PILOT), 0)
+    # Not replayed: nobody may have seen yet whether Dr.Jit can record this scene.
+    pilot = scene.thawed().with_(photon_count=_PATHS)
+    map_ = pilot.photon_map(stream_seed(seed, PILOT), 0)
     return map_.stored / max(map_.emitted, 1)
 
 
