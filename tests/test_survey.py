@@ -234,6 +234,25 @@ def test_path_tracing_has_found_caustics_by_many_hits_or_where_there_are_next_to
     assert not survey._has_found(0 * many, 5e-3 * there, weight)
 
 
+def test_gathers_of_a_pilot_are_recorded_twice(variant_llvm_rgb):
+    """With scores of photons and without, whatever the width of kernels, and map and points."""
+    scene = mi.load_dict(room_with_ball(size=24))
+    prepared = prepare(scene, Settings(map="global"), False).frozen()
+    pilot.settle(prepared, scene.sensors()[0], 0, 16)
+    assert prepared.launch.gather.n_recordings == 2
+
+
+def test_the_dark_counts_beside_what_is_bright():
+    """Errors are relative, but not of what nobody sees beside the bright part of a picture."""
+    tiles = Tiles(1, 40, 40)
+    even, part = np.full((40, 40), 0.8), np.full((40, 40), 1e-3)
+    part[:, 30:] = 1.0  # a quarter of the picture
+    for light, floor in ((even, 0.25 * 0.8), (part, 0.1)):
+        weight = tiles.weight(light.reshape(-1, 1)).reshape(40, 40)
+        expected = 1 / (light**2 + floor**2)
+        np.testing.assert_allclose(weight[:, [0, 20, -1]], expected[:, [0, 20, -1]], rtol=1e-6)
+
+
 def test_several_pairs_stand_for_each_pixel_of_a_small_film(variant_llvm_rgb):
     film = {"type": "hdrfilm", "width": 5, "height": 3, "rfilter": {"type": "box"}}
     sensor = mi.load_dict({"type": "perspective", "film": film})

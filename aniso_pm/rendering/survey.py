@@ -164,7 +164,7 @@ def look(
     bare = decide(use="none", v_own=v_own, later=more)
     if bare.error < best.error:
         maps = [caustics(map_) for map_ in maps]
-        any_ = replace(seen.points, caustic=dr.full(mi.Bool, False, dr.width(seen.points.lane)))
+        any_ = replace(seen.points, caustic=dr.opaque(mi.Bool, False, dr.width(seen.points.lane)))
         found = read(maps, any_, lambda _: weight)
         work = _GOING_ON * seen.work
         plan = decide(use="caustic", v_own=v_own, found=found, later=more, work=work)
@@ -298,7 +298,7 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
         if found:
             weight = weigh(0.5 * (found[0][0][0] + found[0][1][0]))
             weight = arrays.own(mi.Float, np.repeat(weight, 2 * SAMPLES).astype(np.float32))
-            scores = [(dr.zeros(mi.Float, max(map_.stored, 1)), weight) for map_ in maps]
+            scores = [(dr.opaque(mi.Float, 0, max(map_.stored, 1)), weight) for map_ in maps]
         gather = partial(_gathered, scene_, size, seed, points, colours, lanes)
         found.append([gather(*each) for each in zip(maps, scores, strict=True)])
     (a, over_lobes, met), (b, _, _) = found[0]
