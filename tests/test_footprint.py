@@ -3,7 +3,9 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 from aniso_pm.rendering import footprint
+from aniso_pm.rendering.allotment import Allotment
 from aniso_pm.transport.thinning import Thinning
 from rooms import room, room_with_ball
 
@@ -63,17 +65,62 @@ def test_kernels_are_never_wider_than_four_bandwidths_nor_narrower_than_passes_a
     np.testing.assert_allclose(tried.numpy(), eight)
 
 
-def test_of_a_pixels_samples_the_same_number_gathers(variant_llvm_rgb):
-    pixels, samples = 4096, 16
-    lane = dr.arange(mi.UInt32, pixels * samples)
-    for share in (0.125, 0.25, 0.6):
-        each = dr.full(mi.Float, share, pixels)
-        chosen = Thinning.of(each, 5, lane // samples, lane % samples).chosen().numpy()
-        chosen = chosen.reshape(pixels, samples)
-        assert (abs(chosen.sum(1) - share * samples) < 2).all()
+PIXELS = 4096
+
+
+def chosen(share, of, index):
+    """(chosen, weights) of PIXELS pixels' samples in a pass."""
+    lane, each = dr.arange(mi.UInt32, PIXELS * of), dr.full(mi.Float, share, PIXELS)
+    number = dr.opaque(mi.UInt32, of, PIXELS * of)
+    thinning = Thinning.of_pass(each, 5, index, lane // of, lane % of, number)
+    return (found.numpy().reshape(PIXELS, of) for found in thinning.chosen())
+
+
+@pytest.mark.parametrize("of", [1, 3, 16, 27])
+@pytest.mark.parametrize("share", [0.125, 0.25, 0.6, 1.0])
+def test_gathers_of_a_pixel_stand_for_its_samples(variant_llvm_rgb, share, of):
+    made = np.zeros((8, PIXELS))
+    for index in range(8):
+        gathers, weight = chosen(share, of, index)
+        made[index] = gathers.sum(1)
         # Each sample with the same chance: five standard deviations of 4096 draws.
-        spread = 5 * (share * (1 - share) / pixels) ** 0.5
-        assert (abs(chosen.mean(0) - share) < spread).all()
+        spread = 5 * (share * (1 - share) / PIXELS) ** 0.5
+        assert (abs(gathers.mean(0) - share) <= spread).all()
+        stood_for = (gathers * weight).sum(1)
+        if of * share >= 1:  # for all samples, in every pixel and every pass
+            np.testing.assert_allclose(stood_for, of, rtol=1e-6)
+        else:
+            np.testing.assert_allclose(stood_for.mean(), of, rtol=5 * (1 / share / PIXELS) ** 0.5)
+    assert (abs(made - share * of) < 1).all()
+    # Over passes rounding evens out, as far as eight points of a sequence can.
+    assert (abs(made.sum(0) - 8 * share * of) < 2.5).all()
+
+
+def test_gathers_of_a_pixel_are_consecutive_samples(variant_llvm_rgb):
+    """Which makes them stratified; behind the last one comes the first."""
+    gathers, _ = chosen(0.25, 27, 3)
+    begins = gathers & ~np.roll(gathers, 1, axis=1)
+    assert (begins.sum(1) == 1).all()
+
+
+def test_a_choice_does_not_depend_on_wavefronts(variant_llvm_rgb):
+    counts = np.arange(1, 61).repeat(4)
+    for allotment in (Allotment(240, 30, None), Allotment(240, 30, counts)):
+        found = []
+        for most in (10**6, 2000):
+            made = np.zeros((240, 60))
+            for lanes, _ in allotment.wavefronts(3, 0, 0, most):
+                share = dr.full(mi.Float, 0.3, 240)
+                numbers = lanes.pixel, lanes.place, lanes.of
+                gathers, weight = Thinning.of_pass(share, 5, 3, *numbers).chosen()
+                pixel, place = lanes.pixel.numpy(), lanes.place.numpy()
+                made[pixel, place] = dr.select(gathers, weight, 0).numpy()
+                of = np.full(240, 30) if allotment.counts is None else counts
+                np.testing.assert_array_equal(lanes.sample.numpy(), 3 * of[pixel] + place)
+            found.append(made)
+        np.testing.assert_array_equal(*found)
+        enough = of * 0.3 >= 1
+        np.testing.assert_allclose(found[0].sum(1)[enough], of[enough], rtol=1e-6)
 
 
 def test_thinned_gathers_have_the_same_mean(variant_llvm_rgb):

@@ -34,6 +34,7 @@ class Lanes:
 
     pixel   number of the pixel, row by row from the film's border on.
     sample  number of the sample in the sequence of its pixel.
+    place   the same, counted from the first of this pass; of: samples of the pixel in the pass.
     weight  with which it goes into the film; None: 1.
     count   lanes.
     starts  first lane of each of the pixels, and ``count``; a number: so many lanes a pixel.
@@ -41,6 +42,8 @@ class Lanes:
 
     pixel: Any
     sample: Any
+    place: Any
+    of: Any
     weight: Any
     count: int
     first: int
@@ -91,44 +94,49 @@ class Allotment:
                 some = min(at_once, self.pixels - first)
                 done = (part + (first + some) / self.pixels) / slices
                 if self.counts is None:
-                    start = index * self.each + before + low
-                    yield self._even(first, some, start, high - low), done
+                    begin = index * self.each + before
+                    yield self._even(first, some, begin, low, high - low, n), done
                     continue
                 here = slice(first, first + some)
                 if not (high - low)[here].any():
                     continue
-                start = index * self.counts[here] + before + low[here]
-                yield self._uneven(first, start, (high - low)[here], n[here], more), done
+                start = index * self.counts[here] + before
+                part_of = low[here], (high - low)[here]
+                yield self._uneven(first, start, *part_of, n[here], more), done
 
-    def _even(self, first, pixels, start, each) -> Lanes:
+    def _even(self, first, pixels, start, low, each, n) -> Lanes:
+        """``each`` samples of the n of a pass, from ``low`` on; start: number of its first."""
         count = pixels * each
         lane, divisor = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, each)
         pixel = lane // divisor
-        sample = lane - pixel * divisor + dr.opaque(mi.UInt32, start)
+        place = lane - pixel * divisor + dr.opaque(mi.UInt32, low)
+        sample = place + dr.opaque(mi.UInt32, start)
         pixel += dr.opaque(mi.UInt32, first)
-        return Lanes(pixel, sample, None, count, first, pixels, each)
+        of = dr.opaque(mi.UInt32, n, count)
+        return Lanes(pixel, sample, place, of, None, count, first, pixels, each)
 
-    def _uneven(self, first, start, counts, n, more) -> Lanes:
-        """``start``: number of each pixel's first sample; all else is the same in every pass."""
-        key = (first, more, counts.tobytes())
+    def _uneven(self, first, start, low, counts, n, more) -> Lanes:
+        """As ``_even``, of each pixel; all but ``start`` is the same in every pass."""
+        key = (first, more, low.tobytes(), counts.tobytes())
         if key not in self._kept:
             self._kept.clear()
             pixel = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
             place = np.arange(len(pixel), dtype=np.uint32)
             starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.uint32)
-            place -= np.repeat(starts[:-1], counts)
+            place += np.repeat(low.astype(np.uint32) - starts[:-1], counts)
             weight = np.repeat(((self.each + more) / n).astype(np.float32), counts)
             self._kept[key] = (
                 own(mi.UInt32, pixel),
                 own(mi.UInt32, place),
+                own(mi.UInt32, np.repeat(n, counts).astype(np.uint32)),
                 own(mi.Float, weight),
                 own(mi.UInt32, starts),
             )
-        pixel, place, weight, starts = self._kept[key]
+        pixel, place, of, weight, starts = self._kept[key]
         sample = dr.gather(mi.UInt32, own(mi.UInt32, start.astype(np.uint32)), pixel) + place
         count = dr.width(pixel)
         pixel = pixel + dr.opaque(mi.UInt32, first)
-        return Lanes(pixel, sample, weight, count, first, len(counts), starts)
+        return Lanes(pixel, sample, place, of, weight, count, first, len(counts), starts)
 
 
 def in_proportion(noise: np.ndarray, each: int) -> np.ndarray | None:

@@ -127,7 +127,9 @@ class Tracer:
         thinning = None
         if decided.gathering is not None:
             choice = stream_seed(self.seed, THINNING)
-            thinning = Thinning.of(decided.gathering, choice, lanes.pixel, lanes.sample)
+            thinning = Thinning.of_pass(
+                decided.gathering, choice, index, lanes.pixel, lanes.place, lanes.of
+            )
 
         # --- Eye paths and density estimation ---
         if scene.footprint is not None:

@@ -214,7 +214,10 @@ def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray |
     scene = replace(scene, chosen=plan.use, lobes_matter=scene.worth_following(plan.lobes))
     scene = replace(scene, footprint=footprint.of(sensor, 1.0))
     few = dr.opaque(mi.Float, LEAST_SHARE, fine.lanes // SAMPLES)
-    thinning = Thinning.of(few, seed, pixel, sample) if plan.share.min() < 1 else None
+    thinning = None
+    if plan.share.min() < 1:
+        each = dr.opaque(mi.UInt32, SAMPLES, fine.lanes)
+        thinning = Thinning.of_pass(few, seed, 0, pixel, sample, each)
     L, _, _ = scene.trace(sampler, ray, thinning=thinning)
     own = _pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
     weight = fine.weight(own + coarse.refined(plan.gathered, fine)[:, None])

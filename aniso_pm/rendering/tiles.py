@@ -21,7 +21,7 @@ COARSE, FINE, SAMPLES = 4096, 20_000, 4
 _FEWEST = 256
 # A tile's numbers count by so much, the rest is the picture's mean.
 _TRUST = 0.85
-# Brightness below which errors count as absolute, as shares of the median and of the 90th percentile.
+# Brightness below which errors count as absolute: of the median, and of the 90th percentile.
 _FLOOR = 0.25, 0.1
 # Uneven samples have to promise so much less work for the same error: they are a tenth slower.
 _WORTH = 1.1
@@ -76,8 +76,8 @@ class Tiles:
         return pairs.reshape(self.down, self.across)
 
     def weight(self, light) -> np.ndarray:
-        """1/(mean² + floor²) of each pair. The floor is a quarter of the median, or a tenth of what a
-        tenth of the picture exceeds: in a dark room behind a door ajar half of the pixels are so
+        """1/(mean² + floor²) of each pair. The floor is a quarter of the median, or a tenth of what
+        a tenth of the picture exceeds: in a dark room behind a door ajar half of the pixels are so
         dark that beside the bright ones nobody sees their noise."""
         level = smooth(self.grid(light.mean(-1)))
         lit = level[level > 0]

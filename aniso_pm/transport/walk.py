@@ -120,7 +120,7 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
     apart = Apart.begin() if o.use == "survey" else None  # What the survey tells apart
     chosen, worth = mi.Bool(True), mi.Float(1)  # Does the path gather, and for how many others?
     if dr.hint(o.thinning is not None, mode="scalar"):
-        chosen, worth = o.thinning.chosen(), dr.rcp(o.thinning.share)
+        chosen, worth = o.thinning.chosen()
 
     while dr.hint(active, label="eye paths"):
         # --- Find the next vertex ---
