@@ -18,6 +18,7 @@ from ..transport.thinning import Thinning
 from . import film as films
 from .beginning import Decided
 from .done import Traced
+from .evening import Evening
 from .layered import plus
 from .prepared import EYE, PROBE, THINNING, stream_seed
 from .schedule import bandwidth, wavelength_sample
@@ -124,12 +125,12 @@ class Tracer:
         sampler.begin(stream_seed(self.seed, EYE), lanes.pixel, lanes.sample)
         ray, ray_weight, position = films.sample_rays(sensor, sampler, lanes.pixel, colour)
         dr.eval(ray, ray_weight, position)
-        thinning = None
+        thinning, even = None, None
         if decided.gathering is not None:
-            choice = stream_seed(self.seed, THINNING)
-            thinning = Thinning.of_pass(
-                decided.gathering, choice, index, lanes.pixel, lanes.place, lanes.of
-            )
+            choice = stream_seed(self.seed, THINNING, index)
+            places = lanes.pixel, lanes.place, lanes.of
+            thinning = Thinning.of_pass(decided.gathering, choice, *places)
+            even = Evening(thinning, lanes, films.sampled_size(sensor.film())[0])
 
         # --- Eye paths and density estimation ---
         if scene.footprint is not None:
@@ -144,6 +145,7 @@ class Tracer:
             expected=self._points.room,
             lap=self.clock.lap,
             thinning=thinning,
+            even=even,
             for_layers=True,
         )
         self._points.seen(_count(seen.gathered, counts))

@@ -23,6 +23,7 @@ from ..transport.thinning import Thinning
 from ..transport.walk import WalkOptions
 from . import gathering
 from .decisions import Decisions
+from .evening import Evening
 from .footprint import Footprint
 from .gathering import GatherOptions
 from .needs import read_scene
@@ -246,6 +247,7 @@ class Prepared(Decisions):
         expected: int = 0,
         lap=lambda stage: None,
         thinning: Thinning | None = None,
+        even: Evening | None = None,
         for_layers: bool = False,
     ) -> Radiance:
         """Radiance along camera rays: their own share and the map's.
@@ -255,6 +257,7 @@ class Prepared(Decisions):
         expected    gather points to make room for.
         lap         called with the name of each stage that ends.
         thinning    which eye paths gather; None: all.
+        even        adds what evens that out over pixels; None: nothing.
         for_layers  find what layers need that are asked for.
         """
         L, valid, points = self.trace(
@@ -269,16 +272,16 @@ class Prepared(Decisions):
                 map_, radius, seed, points, map_.wavelengths, for_layers=for_layers
             )
 
-            def add(total, part, lane):
-                # Directly: sums of each thread's own would have their size in the code.
-                dr.scatter_add(total, part, lane, mode=dr.ReduceMode.Direct)
-                return total
+            def add(total, *parts):
+                light = dr.zeros(mi.Spectrum, dr.width(ray)) if even else mi.Spectrum(total)
+                for part, found in zip(parts, gathered, strict=True):
+                    # Directly: sums of each thread's own would have their size in the code.
+                    dr.scatter_add(light, part, found.lane, mode=dr.ReduceMode.Direct)
+                return total + light + even(light) if even else light
 
-            L = mi.Spectrum(L)
-            for found in gathered:
-                add(L, found.radiance, found.lane)
-                if found.light is not None:
-                    map_tree(partial(add, lane=found.lane), seen.light, found.light)
+            L = add(L, *(found.radiance for found in gathered))
+            if seen is not None and gathered and gathered[0].light is not None:
+                seen.light = map_tree(add, seen.light, *(found.light for found in gathered))
             dr.eval(L, seen)
         lap("gather")
         return Radiance(L, valid, gathered, seen)

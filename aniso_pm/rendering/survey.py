@@ -217,7 +217,7 @@ def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray |
     thinning = None
     if plan.share.min() < 1:
         each = dr.opaque(mi.UInt32, SAMPLES, fine.lanes)
-        thinning = Thinning.of_pass(few, seed, 0, pixel, sample, each)
+        thinning = Thinning.of_pass(few, seed, pixel, sample, each)
     L, _, _ = scene.trace(sampler, ray, thinning=thinning)
     own = _pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
     weight = fine.weight(own + coarse.refined(plan.gathered, fine)[:, None])

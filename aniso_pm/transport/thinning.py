@@ -7,9 +7,7 @@ follow one another in the sequence of the pixel, from a random one on, so that t
 stratified as all of them; behind the last comes the first again. Each has the weight n/c, and the
 same chance c/n. Where n share is less than one, c is 0 or 1, and the weight 1/share.
 
-Rounding and first sample are, for each pixel, random and then stratified over the passes, as
-the sequence frac(index (1/g, 1/g²)) with g³ = g + 1 (Roberts 2018, "The unreasonable effectiveness
-of quasirandom sequences") is.
+What is random is independent from pixel to pixel and from pass to pass (see ``evening``).
 """
 
 from __future__ import annotations
@@ -20,36 +18,32 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-# 2³² (1/g, 1/g²)
-_STEPS = 0xC13FA9A9, 0x91E10DA5
-
 
 @dataclass
 class Thinning:
     """The choice for one wavefront. Arrays of all lanes.
 
-    share  of the paths, above 0 and at most 1.
-    start  numbers of the pixel and the pass, as two 32-bit fractions.
-    place  of the sample among those of its pixel in the pass.
-    of     so many are these.
+    share   of the paths, above 0 and at most 1.
+    random  two numbers for each pixel and pass, 32 bits.
+    place   of the sample among those of its pixel in the pass; of: so many are these.
     """
 
     share: Any
-    start: tuple[Any, Any]
+    random: tuple[Any, Any]
     place: Any
     of: Any
 
     @staticmethod
-    def of_pass(share, seed: int, index: int, pixel, place, of) -> Thinning:
-        """share: of each pixel (mi.Float). seed: of the rendering; index: of the pass."""
+    def of_pass(share, seed: int, pixel, place, of) -> Thinning:
+        """share: of each pixel (mi.Float). seed: of the pass."""
         share = dr.gather(mi.Float, share, pixel)
-        seed, index = (dr.opaque(mi.UInt32, number) for number in (seed, index))
-        a, b = mi.sample_tea_32(pixel, seed, 8)  # with 4 rounds pixels are alike
-        return Thinning(share, (a + index * _STEPS[0], b + index * _STEPS[1]), place, of)
+        # With 4 rounds pixels are alike.
+        random = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, seed), 8)
+        return Thinning(share, random, place, of)
 
     def chosen(self):
-        """(does the path of each lane gather, and for how many others?)"""
-        rounding, first = (mi.Float(number >> 8) * 2.0**-24 for number in self.start)
+        """(does the path of each lane gather?, for how many?)"""
+        rounding, first = (mi.Float(number >> 8) * 2.0**-24 for number in self.random)
         n = mi.Float(self.of)
         c = dr.minimum(mi.UInt32(n * self.share + rounding), self.of)
         place = self.place + dr.minimum(mi.UInt32(first * n), self.of - 1)

@@ -1,0 +1,75 @@
+"""Light that few samples gather for many, evened out over their pixels.
+
+Where one sample in eight gathers, with the weight 8, reconstruction filters see few bright samples
+among many dark ones: g (Σ f w/Σ f − 1) is noise, however even the gathered light g is. So each
+sample with the weight w (n/c, or 0: see ``thinning``) also gets (1 − w) ĝ, a control variate: ĝ is
+what the gathers of the pixels around its own found. Those are chosen independently of it, and the
+mean of w is 1, so that the mean of the picture stays exactly what it is, and what is left of
+the noise is that of w (g − ĝ).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.thinning import Thinning
+from .allotment import Lanes
+
+# Pixels around a pixel that say what it will gather, as far away along rows and columns.
+_REACH = 1
+
+
+@dataclass
+class Evening:
+    """For one wavefront. wide: pixels of a row of the film."""
+
+    thinning: Thinning
+    lanes: Lanes
+    wide: int
+
+    def __call__(self, gathered):
+        """(1 − w) ĝ of each lane. gathered: what each lane gathers, its weight included."""
+        gathers, worth = self.thinning.chosen()
+        weight = dr.select(gathers, worth, 0)
+        gathered = dr.select(dr.all(dr.isfinite(gathered)), gathered, 0)
+        dr.eval(gathered, weight)
+        light, weights = self._in_pixels(gathered, weight)
+        dr.eval(light, weights)
+        around = self._around(light, weights)
+        dr.eval(around)
+        pixel = self.lanes.pixel - dr.opaque(mi.UInt32, self.lanes.first)
+        return (1 - weight) * dr.gather(type(around), around, pixel)
+
+    @dr.syntax
+    def _in_pixels(self, gathered, weight):
+        """Sums over the lanes of each pixel."""
+        pixel = dr.arange(mi.UInt32, self.lanes.pixels)
+        begin, end = self.lanes.begin(pixel), self.lanes.begin(pixel + 1)
+        light, weights = dr.zeros(type(gathered)), mi.Float(0)
+        while dr.hint(begin < end, label="samples of a pixel"):
+            light += dr.gather(type(gathered), gathered, begin)
+            weights += dr.gather(mi.Float, weight, begin)
+            begin += 1
+        return light, weights
+
+    def _around(self, light, weights):
+        """ĝ of each pixel: Σ w g/Σ w of those around it; 0 where nothing is gathered there."""
+        pixels = dr.opaque(mi.Int32, self.lanes.pixels)
+        wide = dr.opaque(mi.Int32, self.wide)
+        pixel = dr.arange(mi.Int32, self.lanes.pixels)
+        column = (pixel + dr.opaque(mi.Int32, self.lanes.first)) % wide
+        total, total_weight = dr.zeros(type(light)), mi.Float(0)
+        reach = range(-_REACH, _REACH + 1)
+        for dy in reach:
+            for dx in reach:
+                if dx == dy == 0:
+                    continue
+                other = pixel + dy * wide + dx
+                there = (column + dx >= 0) & (column + dx < wide) & (other >= 0) & (other < pixels)
+                index = mi.UInt32(dr.select(there, other, 0))
+                total += dr.gather(type(light), light, index, there)
+                total_weight += dr.gather(mi.Float, weights, index, there)
+        return dr.select(total_weight > 0, total / total_weight, 0)

@@ -1,0 +1,65 @@
+"""Light that few samples gather for many, evened out over pixels: less noise, the same mean."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from aniso_pm.rendering.allotment import Allotment
+from aniso_pm.rendering.evening import Evening
+from aniso_pm.transport.thinning import Thinning
+
+WIDE, HIGH = 12, 10
+COUNTS = np.arange(WIDE * HIGH) % 5 + 2
+
+
+def wavefronts(index, share, most=10**6, counts=COUNTS):
+    """(Evening, Lanes, w) of a pass."""
+    each = 4 if counts is None else int(counts.mean())
+    allotment = Allotment(WIDE * HIGH, each, counts)
+    for lanes, _ in allotment.wavefronts(index, 0, 0, most):
+        shares = dr.full(mi.Float, share, WIDE * HIGH)
+        thinning = Thinning.of_pass(shares, 7 + index, lanes.pixel, lanes.place, lanes.of)
+        gathers, worth = thinning.chosen()
+        yield Evening(thinning, lanes, WIDE), lanes, dr.select(gathers, worth, 0).numpy()
+
+
+@pytest.mark.parametrize("counts", [None, COUNTS], ids=["even", "uneven"])
+@pytest.mark.parametrize("most", [10**6, 200, 50])
+def test_even_light_is_without_noise(variant_llvm_rgb, counts, most):
+    """Whatever parts of the film, and of the samples, are in a wavefront."""
+    for even, lanes, w in wavefronts(3, 0.5, most, counts):
+        added = even(mi.Color3f(mi.Float(w) * mi.Color3f(1, 2, 3))).numpy()
+        pixel = lanes.pixel.numpy()
+        gathered = np.bincount(pixel, w, WIDE * HIGH).reshape(HIGH, WIDE)
+        around = sum(
+            np.roll(np.pad(gathered, 1), (dy, dx), (0, 1))[1:-1, 1:-1]
+            for dy in (-1, 0, 1)
+            for dx in (-1, 0, 1)
+            if dx or dy
+        )
+        known = around.ravel()[pixel] > 0
+        assert known.mean() > 0.5
+        expected = np.where(known, 1 - w, 0)
+        np.testing.assert_allclose(added, expected * np.array([[1], [2], [3]]), atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.125, 0.6])
+def test_the_mean_is_what_is_gathered(variant_llvm_rgb, share):
+    """Over passes, in each pixel, of light that is different in every sample."""
+    passes, light = 400, np.random.default_rng(1).gamma(1, size=int(COUNTS.sum()))
+    found = []
+    for index in range(passes):
+        ((even, lanes, w),) = wavefronts(index, share)
+        added = even(mi.Color3f(mi.Float(w * light))).numpy()[0]
+        found.append(np.bincount(lanes.pixel.numpy(), w * light + added))
+    found = np.array(found)
+    expected = np.bincount(lanes.pixel.numpy(), light)
+    z = (found.mean(0) - expected) / (found.std(0) / passes**0.5 + 1e-6)
+    assert 0.6 < (z**2).mean() < 1.5
+    assert abs(z.mean()) < 0.3
+
+
+def test_what_is_not_finite_stays_where_it_is(variant_llvm_rgb):
+    ((even, lanes, w),) = wavefronts(0, 1.0)
+    light = np.where(np.arange(len(w)) == 100, np.nan, w)
+    assert np.isfinite(even(mi.Color3f(mi.Float(light))).numpy()).all()
