@@ -6,6 +6,10 @@ sample with the weight w (n/c, or 0: see ``thinning``) also gets (1 − w) ĝ, a
 what the gathers of the pixels around its own found. Those are chosen independently of it, and the
 mean of w is 1, so that the mean of the picture stays exactly what it is, and what is left of
 the noise is that of w (g − ĝ).
+
+Of the four sides of a pixel ĝ is the darkest, and 0 where nothing is gathered on one of them: at
+edges of dark things w g + (1 − w) ĝ would be far below zero. What remains of that is gone after a
+few samples; sums over passes keep it, pictures of them show it as black.
 """
 
 from __future__ import annotations
@@ -18,8 +22,11 @@ import mitsuba as mi
 from ..transport.thinning import Thinning
 from .allotment import Lanes
 
-# Pixels around a pixel that say what it will gather, as far away along rows and columns.
-_REACH = 1
+# Pixels on each side of a pixel: (columns, rows) away.
+_ACROSS = -1, 0, 1
+_SIDES = [
+    [(side, d) if along else (d, side) for d in _ACROSS] for along in (0, 1) for side in (-1, 1)
+]
 
 
 @dataclass
@@ -41,35 +48,36 @@ class Evening:
         around = self._around(light, weights)
         dr.eval(around)
         pixel = self.lanes.pixel - dr.opaque(mi.UInt32, self.lanes.first)
-        return (1 - weight) * dr.gather(type(around), around, pixel)
+        return (1 - weight) * dr.gather(mi.Spectrum, around, pixel)
 
     @dr.syntax
     def _in_pixels(self, gathered, weight):
         """Sums over the lanes of each pixel."""
         pixel = dr.arange(mi.UInt32, self.lanes.pixels)
         begin, end = self.lanes.begin(pixel), self.lanes.begin(pixel + 1)
-        light, weights = dr.zeros(type(gathered)), mi.Float(0)
+        light, weights = dr.zeros(mi.Spectrum), mi.Float(0)
         while dr.hint(begin < end, label="samples of a pixel"):
-            light += dr.gather(type(gathered), gathered, begin)
+            light += dr.gather(mi.Spectrum, gathered, begin)
             weights += dr.gather(mi.Float, weight, begin)
             begin += 1
         return light, weights
 
     def _around(self, light, weights):
-        """ĝ of each pixel: Σ w g/Σ w of those around it; 0 where nothing is gathered there."""
+        """ĝ of each pixel."""
         pixels = dr.opaque(mi.Int32, self.lanes.pixels)
         wide = dr.opaque(mi.Int32, self.wide)
         pixel = dr.arange(mi.Int32, self.lanes.pixels)
         column = (pixel + dr.opaque(mi.Int32, self.lanes.first)) % wide
-        total, total_weight = dr.zeros(type(light)), mi.Float(0)
-        reach = range(-_REACH, _REACH + 1)
-        for dy in reach:
-            for dx in reach:
-                if dx == dy == 0:
-                    continue
+        least = mi.Spectrum(dr.inf)
+        for side in _SIDES:
+            total, total_weight, outside = dr.zeros(mi.Spectrum), mi.Float(0), mi.Bool(True)
+            for dx, dy in side:
                 other = pixel + dy * wide + dx
                 there = (column + dx >= 0) & (column + dx < wide) & (other >= 0) & (other < pixels)
                 index = mi.UInt32(dr.select(there, other, 0))
-                total += dr.gather(type(light), light, index, there)
+                total += dr.gather(mi.Spectrum, light, index, there)
                 total_weight += dr.gather(mi.Float, weights, index, there)
-        return dr.select(total_weight > 0, total / total_weight, 0)
+                outside &= ~there
+            found = dr.select(total_weight > 0, total / total_weight, 0)
+            least = dr.select(outside, least, dr.minimum(least, found))
+        return dr.select(dr.isfinite(least), least, 0)

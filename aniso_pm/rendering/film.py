@@ -104,11 +104,19 @@ def to_rgb(spectrum, wavelengths):
 
 
 def show(film, image):
-    """Let the film hold ``image`` (as of :func:`splat`) and nothing else."""
+    """Let the film hold ``image`` (as of :func:`splat`) and nothing else. What is left below zero
+    after a few samples (see ``evening``) is black, where nothing but that can be below zero."""
+    if not mi.is_spectral and not _undershoots(film.rfilter()):
+        image = mi.TensorXf(dr.maximum(image.array, 0), image.shape)
     film.clear()
     film.put_block(mi.ImageBlock(image, mi.ScalarPoint2i(film.crop_offset())))
     film.schedule_storage()
     dr.eval()
+
+
+def _undershoots(rfilter) -> bool:
+    """Has the filter negative lobes?"""
+    return dr.any(rfilter.eval(dr.linspace(mi.Float, 0, rfilter.radius(), 64)) < 0)[0]
 
 
 def show_array(film, array):
