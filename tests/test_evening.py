@@ -8,6 +8,7 @@ from aniso_pm.rendering import film as films
 from aniso_pm.rendering.allotment import Allotment
 from aniso_pm.rendering.evening import Evening
 from aniso_pm.transport.thinning import Thinning
+from rooms import room_with_plate
 
 WIDE, HIGH = 12, 10
 COUNTS = np.arange(WIDE * HIGH) % 5 + 2
@@ -81,3 +82,14 @@ def test_nothing_is_shown_below_zero(variant_llvm_rgb, kind):
     image[1, 2, 0] = -0.1
     films.show_array(film, image)
     assert np.array(film.develop())[1, 2, 0] == np.float32(0 if kind == "gaussian" else -0.1)
+
+
+@pytest.mark.parametrize("variant", ["rgb", "mono", "spectral"])
+def test_energy_is_that_of_path_where_few_gather(request, variant):
+    request.getfixturevalue(f"variant_llvm_{variant}")
+    scene = mi.load_dict(room_with_plate(size=16))
+    plugin = mi.load_dict({"type": "aniso_pm", "map": "global", "passes": 4})
+    image = np.array(mi.render(scene, integrator=plugin, spp=256))
+    assert plugin.statistics["share_of_gathers"] < 0.6
+    path = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=4096))
+    assert image.mean() == pytest.approx(path.mean(), rel=0.02)

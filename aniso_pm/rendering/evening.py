@@ -41,7 +41,7 @@ class Evening:
         """(1 − w) ĝ of each lane. gathered: what each lane gathers, its weight included."""
         gathers, worth = self.thinning.chosen()
         weight = dr.select(gathers, worth, 0)
-        gathered = dr.select(dr.all(dr.isfinite(gathered)), gathered, 0)
+        gathered = _where(dr.all(dr.isfinite(gathered)), gathered)
         dr.eval(gathered, weight)
         light, weights = self._in_pixels(gathered, weight)
         dr.eval(light, weights)
@@ -78,6 +78,11 @@ class Evening:
                 total += dr.gather(mi.Spectrum, light, index, there)
                 total_weight += dr.gather(mi.Float, weights, index, there)
                 outside &= ~there
-            found = dr.select(total_weight > 0, total / total_weight, 0)
+            found = _where(total_weight > 0, total / total_weight)
             least = dr.select(outside, least, dr.minimum(least, found))
-        return dr.select(dr.isfinite(least), least, 0)
+        return _where(dr.isfinite(least), least)
+
+
+def _where(mask, spectrum):
+    """The spectrum, 0 elsewhere; ``dr.select`` makes another type of some spectra."""
+    return mi.Spectrum(dr.select(mask, spectrum, 0))
