@@ -7,7 +7,7 @@ what the gathers of the pixels around its own found. Those are chosen independen
 mean of w is 1, so that the mean of the picture stays exactly what it is, and what is left of
 the noise is that of w (g − ĝ).
 
-Of the four sides of a pixel ĝ is the darkest, and 0 where nothing is gathered on one of them: at
+Of the four sides of a pixel ĝ is the darkest, and 0 where nothing is gathered on two of them: at
 edges of dark things w g + (1 − w) ĝ would be far below zero. What remains of that is gone after a
 few samples; sums over passes keep it, pictures of them show it as black.
 """
@@ -68,7 +68,7 @@ class Evening:
         wide = dr.opaque(mi.Int32, self.wide)
         pixel = dr.arange(mi.Int32, self.lanes.pixels)
         column = (pixel + dr.opaque(mi.Int32, self.lanes.first)) % wide
-        least = mi.Spectrum(dr.inf)
+        least, missing = mi.Spectrum(dr.inf), mi.UInt32(0)
         for side in _SIDES:
             total, total_weight, outside = dr.zeros(mi.Spectrum), mi.Float(0), mi.Bool(True)
             for dx, dy in side:
@@ -78,9 +78,10 @@ class Evening:
                 total += dr.gather(mi.Spectrum, light, index, there)
                 total_weight += dr.gather(mi.Float, weights, index, there)
                 outside &= ~there
-            found = _where(total_weight > 0, total / total_weight)
-            least = dr.select(outside, least, dr.minimum(least, found))
-        return _where(dr.isfinite(least), least)
+            some = total_weight > 0
+            least = dr.select(some, dr.minimum(least, total / total_weight), least)
+            missing += dr.select(some | outside, mi.UInt32(0), 1)
+        return _where(dr.isfinite(least) & (missing < 2), least)
 
 
 def _where(mask, spectrum):
