@@ -41,7 +41,6 @@ class Evening:
         """(1 − w) ĝ of each lane. gathered: what each lane gathers, its weight included."""
         gathers, worth = self.thinning.chosen()
         weight = dr.select(gathers, worth, 0)
-        gathered = _where(dr.all(dr.isfinite(gathered)), gathered)
         dr.eval(gathered, weight)
         light, weights = self._in_pixels(gathered, weight)
         dr.eval(light, weights)
@@ -79,6 +78,7 @@ class Evening:
                 total_weight += dr.gather(mi.Float, weights, index, there)
                 outside &= ~there
             some = total_weight > 0
+            some &= dr.all(dr.isfinite(total))
             least = dr.select(some, dr.minimum(least, total / total_weight), least)
             missing += dr.select(some | outside, mi.UInt32(0), 1)
         return _where(dr.isfinite(least) & (missing < 2), least)

@@ -125,7 +125,7 @@ class Tracer:
         sampler.begin(stream_seed(self.seed, EYE), lanes.pixel, lanes.sample)
         ray, ray_weight, position = films.sample_rays(sensor, sampler, lanes.pixel, colour)
         dr.eval(ray, ray_weight, position)
-        thinning, even = None, None
+        even = None
         if decided.gathering is not None:
             choice = stream_seed(self.seed, THINNING, index)
             places = lanes.pixel, lanes.place, lanes.of
@@ -144,7 +144,6 @@ class Tracer:
             random,
             expected=self._points.room,
             lap=self.clock.lap,
-            thinning=thinning,
             even=even,
             for_layers=True,
         )

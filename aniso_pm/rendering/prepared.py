@@ -19,7 +19,6 @@ from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
 from ..transport.amends import repair_bounds
 from ..transport.focus import Focus
-from ..transport.thinning import Thinning
 from ..transport.walk import WalkOptions
 from . import gathering
 from .decisions import Decisions
@@ -246,7 +245,6 @@ class Prepared(Decisions):
         seed: int,
         expected: int = 0,
         lap=lambda stage: None,
-        thinning: Thinning | None = None,
         even: Evening | None = None,
         for_layers: bool = False,
     ) -> Radiance:
@@ -256,12 +254,15 @@ class Prepared(Decisions):
         seed        of the random numbers that density estimation takes.
         expected    gather points to make room for.
         lap         called with the name of each stage that ends.
-        thinning    which eye paths gather; None: all.
-        even        adds what evens that out over pixels; None: nothing.
+        even        which eye paths gather, and what evens that out; None: all do.
         for_layers  find what layers need that are asked for.
         """
         L, valid, points = self.trace(
-            sampler, ray, expected, thinning=thinning, for_layers=for_layers
+            sampler,
+            ray,
+            expected,
+            thinning=even.thinning if even else None,
+            for_layers=for_layers,
         )
         lap("eye")
         gathered, seen = [], None
