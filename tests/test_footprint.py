@@ -55,7 +55,7 @@ def test_kernels_are_never_wider_than_four_bandwidths_nor_narrower_than_passes_a
     variant_llvm_rgb,
 ):
     found = footprint.of(camera(), 1.0, 1e-3)
-    for least, index in ((1 / 4, 0), (1 / 4, 3), (1 / 5, 4), (1 / 100, 99)):
+    for least, index in ((1 / 16, 0), (1 / 16, 15), (1 / 17, 16), (1 / 100, 99)):
         np.testing.assert_allclose(shares(found.in_pass(index), [0]), least, rtol=1e-6)
     wide = footprint.of(camera(), 1e-6).in_pass(0)
     np.testing.assert_allclose(shares(wide, [100]), 4)

@@ -4,7 +4,7 @@ With f the footprint of a pixel at a gather point (world units, its width there,
 path), w the width of the kernel in pixels (``survey`` finds it pixel by pixel), and r_i the
 bandwidth of pass i (0-based, see ``schedule``), the kernel's radius is
 
-    r(p) = clip(w f r_i/r_0, l_i r_i, 4 r_i),      l_i = 1/max(4, i + 1).
+    r(p) = clip(w f r_i/r_0, l_i r_i, 4 r_i),      l_i = 1/max(16, i + 1).
 
 Everything shrinks from pass to pass, so that the mean over passes converges as with one radius; r_i
 and l_i are functions of i alone, however many passes there will be: passes that were rendered apart
@@ -28,7 +28,7 @@ from .film import sample_ray
 TRIED = 8.0
 # Kernels of the first passes may be narrower than the bandwidth by so much, kernels of all passes
 # wider.
-_LEAST, _MOST = 4, 4
+_LEAST, _MOST = 16, 4
 
 
 @dataclass  # not frozen: Dr.Jit traverses it
