@@ -7,6 +7,7 @@ import pytest
 from aniso_pm.rendering import film as films
 from aniso_pm.rendering.allotment import Allotment
 from aniso_pm.rendering.evening import Evening
+from aniso_pm.transport import layers
 from aniso_pm.transport.thinning import Thinning
 from rooms import room_with_plate
 
@@ -30,7 +31,7 @@ def wavefronts(index, share, most=10**6, counts=COUNTS):
 def test_even_light_is_without_noise(variant_llvm_rgb, counts, most):
     """Whatever parts of the film, and of the samples, are in a wavefront."""
     for even, lanes, w in wavefronts(3, 0.5, most, counts):
-        added = even(mi.Color3f(mi.Float(w) * mi.Color3f(1, 2, 3))).numpy()
+        added = even(mi.Color3f(mi.Float(w) * mi.Color3f(1, 2, 3)))[0].numpy()
         pixel = lanes.pixel.numpy()
         places = np.arange(WIDE * HIGH).reshape(HIGH, WIDE) - lanes.first
         here = (places >= 0) & (places < lanes.pixels)
@@ -59,7 +60,7 @@ def test_the_mean_is_what_is_gathered(variant_llvm_rgb, share):
     found = []
     for index in range(passes):
         ((even, lanes, w),) = wavefronts(index, share)
-        added = even(mi.Color3f(mi.Float(w * light))).numpy()[0]
+        added = even(mi.Color3f(mi.Float(w * light)))[0].numpy()[0]
         found.append(np.bincount(lanes.pixel.numpy(), w * light + added))
     found = np.array(found)
     expected = np.bincount(lanes.pixel.numpy(), light)
@@ -71,7 +72,7 @@ def test_the_mean_is_what_is_gathered(variant_llvm_rgb, share):
 def test_what_is_not_finite_stays_where_it_is(variant_llvm_rgb):
     ((even, lanes, w),) = wavefronts(0, 1.0)
     light = np.where(np.arange(len(w)) == 100, np.nan, w)
-    assert np.isfinite(even(mi.Color3f(mi.Float(light))).numpy()).all()
+    assert np.isfinite(even(mi.Color3f(mi.Float(light)))[0].numpy()).all()
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "lanczos"])
@@ -94,3 +95,16 @@ def test_energy_is_that_of_path_where_few_gather(request, variant):
     assert plugin.statistics["share_of_gathers"] < 0.6
     path = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=4096))
     assert image.mean() == pytest.approx(path.mean(), rel=0.02)
+
+
+@pytest.mark.parametrize("variant", ["rgb", "mono", "spectral"])
+def test_layers_of_light_add_up_where_few_gather(request, variant):
+    request.getfixturevalue(f"variant_llvm_{variant}")
+    scene = room_with_plate(size=16)
+    scene["sensor"]["film"]["rfilter"] = {"type": "lanczos"}  # pictures keep what is below zero
+    asked = {"type": "aniso_pm", "map": "global", "passes": 2, "layers": ",".join(layers.LIGHT)}
+    plugin = mi.load_dict(asked)
+    image = np.array(mi.render(mi.load_dict(scene), integrator=plugin, spp=32))[..., :3]
+    assert plugin.statistics["share_of_gathers"] < 0.6
+    total = sum(plugin.layers[name] for name in layers.LIGHT)
+    np.testing.assert_allclose(total, np.broadcast_to(image, total.shape), atol=2e-5)

@@ -37,53 +37,64 @@ class Evening:
     lanes: Lanes
     wide: int
 
-    def __call__(self, gathered):
-        """(1 − w) ĝ of each lane. gathered: what each lane gathers, its weight included."""
+    def __call__(self, gathered, *parts):
+        """(1 − w) ĝ of each lane. gathered: what each lane gathers, its weight included.
+
+        Returns a list: that of ``gathered``, and of parts of it, with the ĝ of the same sides, so
+        that parts that add up still do.
+        """
         gathers, worth = self.thinning.chosen()
         weight = dr.select(gathers, worth, 0)
-        dr.eval(gathered, weight)
-        light, weights = self._in_pixels(gathered, weight)
-        dr.eval(light, weights)
-        around = self._around(light, weights)
+        dr.eval(gathered, *parts, weight)
+        weights, *lights = (self._in_pixels(v) for v in (weight, gathered, *parts))
+        dr.eval(weights, lights)
+        around = self._around(weights, *lights)
         dr.eval(around)
         pixel = self.lanes.pixel - dr.opaque(mi.UInt32, self.lanes.first)
-        return (1 - weight) * dr.gather(mi.Spectrum, around, pixel)
+        return [(1 - weight) * dr.gather(mi.Spectrum, light, pixel) for light in around]
 
     @dr.syntax
-    def _in_pixels(self, gathered, weight):
+    def _in_pixels(self, values):
         """Sums over the lanes of each pixel."""
         pixel = dr.arange(mi.UInt32, self.lanes.pixels)
         begin, end = self.lanes.begin(pixel), self.lanes.begin(pixel + 1)
-        light, weights = dr.zeros(mi.Spectrum), mi.Float(0)
+        total = dr.zeros(type(values))
         while dr.hint(begin < end, label="samples of a pixel"):
-            light += dr.gather(mi.Spectrum, gathered, begin)
-            weights += dr.gather(mi.Float, weight, begin)
+            total += dr.gather(type(values), values, begin)
             begin += 1
-        return light, weights
+        return total
 
-    def _around(self, light, weights):
-        """ĝ of each pixel."""
+    def _around(self, weights, light, *parts):
+        """ĝ of each pixel, and the parts of it: lists."""
         pixels = dr.opaque(mi.Int32, self.lanes.pixels)
         wide = dr.opaque(mi.Int32, self.wide)
         pixel = dr.arange(mi.Int32, self.lanes.pixels)
         column = (pixel + dr.opaque(mi.Int32, self.lanes.first)) % wide
-        least, missing = mi.Spectrum(dr.inf), mi.UInt32(0)
+        missing, least = mi.UInt32(0), mi.Spectrum(dr.inf)
+        least_parts = [dr.zeros(mi.Spectrum) for _ in parts]
         for side in _SIDES:
-            total, total_weight, outside = dr.zeros(mi.Spectrum), mi.Float(0), mi.Bool(True)
+            total_weight, outside = mi.Float(0), mi.Bool(True)
+            totals = [dr.zeros(mi.Spectrum) for _ in (light, *parts)]
             for dx, dy in side:
                 other = pixel + dy * wide + dx
                 there = (column + dx >= 0) & (column + dx < wide) & (other >= 0) & (other < pixels)
                 index = mi.UInt32(dr.select(there, other, 0))
-                total += dr.gather(mi.Spectrum, light, index, there)
+                totals = [
+                    total + dr.gather(mi.Spectrum, values, index, there)
+                    for total, values in zip(totals, (light, *parts), strict=True)
+                ]
                 total_weight += dr.gather(mi.Float, weights, index, there)
                 outside &= ~there
             some = total_weight > 0
-            some &= dr.all(dr.isfinite(total))
-            least = dr.select(some, dr.minimum(least, total / total_weight), least)
+            some &= dr.all(dr.isfinite(totals[0]))
+            mean, *mean_parts = (total / total_weight for total in totals)
+            darker = some & (mean < least)  # of each colour
+            least = mi.Spectrum(dr.select(darker, mean, least))
+            least_parts = [
+                mi.Spectrum(dr.select(darker, part, best))
+                for part, best in zip(mean_parts, least_parts, strict=True)
+            ]
             missing += dr.select(some | outside, mi.UInt32(0), 1)
-        return _where(dr.isfinite(least) & (missing < 2), least)
-
-
-def _where(mask, spectrum):
-    """The spectrum, 0 elsewhere; ``dr.select`` makes another type of some spectra."""
-    return mi.Spectrum(dr.select(mask, spectrum, 0))
+        known = dr.isfinite(least) & (missing < 2)
+        # ``dr.select`` makes another type of some spectra.
+        return [mi.Spectrum(dr.select(known, v, 0)) for v in (least, *least_parts)]

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..errors import Unsupported
 from ..map import density, summed
-from ..map.gather_points import GatherPoints, map_tree, take
+from ..map.gather_points import GatherPoints, take
 from ..map.photon_map import EMPTY, PhotonMap
 from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
@@ -273,19 +273,32 @@ class Prepared(Decisions):
                 map_, radius, seed, points, map_.wavelengths, for_layers=for_layers
             )
 
-            def add(total, *parts):
-                light = dr.zeros(mi.Spectrum, dr.width(ray)) if even else mi.Spectrum(total)
-                for part, found in zip(parts, gathered, strict=True):
-                    # Directly: sums of each thread's own would have their size in the code.
-                    dr.scatter_add(light, part, found.lane, mode=dr.ReduceMode.Direct)
-                return total + light + even(light) if even else light
-
-            L = add(L, *(found.radiance for found in gathered))
+            totals, found = [L], [[f.radiance for f in gathered]]
             if seen is not None and gathered and gathered[0].light is not None:
-                seen.light = map_tree(add, seen.light, *(found.light for found in gathered))
+                totals += [getattr(seen.light, name) for name in layers.LIGHT]
+                found += [[getattr(f.light, name) for f in gathered] for name in layers.LIGHT]
+            lanes = [f.lane for f in gathered]
+            if even:
+                nothing = dr.zeros(mi.Spectrum, dr.width(ray))
+                read = [_scattered(nothing, lanes, values) for values in found]
+                totals = [a + b + c for a, b, c in zip(totals, read, even(*read), strict=True)]
+            else:
+                totals = [_scattered(a, lanes, b) for a, b in zip(totals, found, strict=True)]
+            L, *parts = totals
+            if parts:
+                seen.light = layers.Light(*parts)
             dr.eval(L, seen)
         lap("gather")
         return Radiance(L, valid, gathered, seen)
+
+
+def _scattered(total, lanes, values):
+    """``total`` of each eye path, and the values of its gather points."""
+    total = mi.Spectrum(total)
+    for lane, value in zip(lanes, values, strict=True):
+        # Directly: sums of each thread's own would have their size in the code.
+        dr.scatter_add(total, value, lane, mode=dr.ReduceMode.Direct)
+    return total
 
 
 def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
