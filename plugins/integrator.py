@@ -74,8 +74,8 @@ class AnisoPhotonMapper:
          glossy surfaces; the rest is path traced, and scenes without caustics have no map.
          ``auto``: a pilot finds out which of the two, or path tracing without any photon, has
          the least error for the time in this scene; path tracing only if the pilot's eye paths
-         have met most of the light of the caustics, no light is a point or a direction, and
-         neither ``photon_count`` nor ``initial_radius`` is given.
+         have met most of the light of the caustics, or there is next to none, no light is a point
+         or a direction, and neither ``photon_count`` nor ``initial_radius`` is given.
          Scenes without surfaces that light is traced over (glass, mirrors, smooth or coated metal)
          are path traced, those with lights that only photons find take ``global``.
          ``statistics["map"]`` tells which it was, or "none", and ``statistics["map_errors"]`` the
@@ -128,9 +128,9 @@ class AnisoPhotonMapper:
          :math:`|s \times t| = r^2`, cut at :math:`a^2+b^2=4`. 0 chooses the radius at which a
          kernel holds 60 photons, in the median over the light that the camera sees
          (``statistics["initial_radius"]``), and makes kernels narrower where the light that a pilot
-         finds is not smooth: 1 to 32 widths of a pixel where the kernel is, between four times
-         that radius and a quarter of it in the first four passes, 1/(i+1) of it in pass i.
-         (Default: 0)
+         finds is not smooth, wider where it is: 1 to 32 widths of a pixel where the kernel is,
+         between four times the radius of the pass and a sixteenth of it in the first sixteen
+         passes, 1/(i+1) of it in pass i, counted from 0. (Default: 0)
 
      * - alpha
        - |float|

@@ -45,7 +45,7 @@ def test_case(one):
 def test_there_are_enough_cases_with_titles_of_their_own_and_known_regions():
     assert len(CASES) >= 60
     assert len({c.title for c in CASES}) == len(CASES)
-    assert {c.region for c in CASES} - {None} <= regions.KEYS
+    assert {c.region for c in CASES} - {None} <= {region.key for region in regions.REGIONS}
 
 
 # --- Verdicts ------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
-"""Make ``scenes/pictures``: ``python tools/make_pictures.py comparison bars gallery bandwidth``.
+"""Make ``scenes/pictures``: ``python tools/make_pictures.py comparison gallery bandwidth``.
 
 comparison  teapot and pan as the scenes have them, with both kernels, beside their references.
-bars        the same of the brushed wall, with few photons and few eye samples.
 gallery     all references.
 bandwidth   how large the kernels behind each pixel are, beside the picture.
 
@@ -75,31 +74,6 @@ def comparison():
     figure.savefig(SCENES / "pictures" / "comparison.png", dpi=100, pil_kwargs={"optimize": True})
 
 
-def bars():
-    """One row: isotropic, anisotropic, reference; both kernels with the same photons and paths."""
-    from matplotlib import pyplot as plt
-
-    scene = mi.load_file(str(SCENES / "brushed_wall.xml"), optimize=False)
-    compared = references.read(SCENES / "references" / "brushed_wall.exr")
-    columns = []
-    for kernel in ("isotropic", "anisotropic"):
-        parameters = {"type": "aniso_pm", "kernel": kernel, "passes": 4, "photon_count": 250_000}
-        image, plugin = render(scene, parameters, 16, 1)
-        error = relative_rmse(image - compared.mean, compared.mean)
-        energy = image.mean() / compared.mean.mean()
-        print(f"brushed_wall {kernel}: relative RMSE {error:.4f}, mean-energy ratio {energy:.4f}")
-        columns.append((f"{kernel}: relative RMSE {100 * error:.1f} %", image))
-    own = compared.own_error
-    columns.append((f"path, reference (own error {100 * own:.1f} %)", compared.mean))
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.4), dpi=100, facecolor="white")
-    for ax, (title, image) in zip(axes, columns, strict=True):
-        ax.imshow(srgb(2.5 * image), interpolation="nearest")
-        ax.set_title(title, fontsize=11)
-        ax.set_axis_off()
-    figure.tight_layout(pad=0.4)
-    figure.savefig(SCENES / "pictures" / "bars.png", dpi=100, pil_kwargs={"optimize": True})
-
-
 def gallery():
     """All references of 160 x 120 pixels, each as bright as its brightest twentieth allows."""
     from matplotlib import pyplot as plt
@@ -151,7 +125,7 @@ def bandwidth():
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    makers = {maker.__name__: maker for maker in (comparison, bars, gallery, bandwidth)}
+    makers = {maker.__name__: maker for maker in (comparison, gallery, bandwidth)}
     parser.add_argument("what", nargs="+", choices=list(makers))
     mi.set_variant("llvm_ad_rgb")
     for name in parser.parse_args().what:

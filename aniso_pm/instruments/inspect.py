@@ -126,7 +126,7 @@ def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
         Finding(
             "edge compensation",
             settings.edge_compensation and scene.needs_map,
-            "short rays measure how much of each kernel lies on the surface",
+            "short rays measure how much of each kernel lies on the surface, and end it at walls",
             [f"edge_compensation={str(settings.edge_compensation).lower()}"],
         ),
         Finding(

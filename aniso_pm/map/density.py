@@ -6,7 +6,7 @@ With M light paths and photons of flux Φ_j at offsets d_j, the irradiance at p1
 
 and the reflected radiance is E times the BRDF of p1; on receivers that are not Lambertian every
 photon brings its own direction, and the BRDF goes into the sum. Photons count only if they lie on
-the same surface: |d·n| within half a bandwidth (or less, see ``Prepared.thickness``), normals
+the same surface: |d·n| within half a bandwidth (or less, see ``gathering.thickness``), normals
 within 41 degrees (cosine 0.75), and (n + n')·d within 5 % of |d|: on every quadric, flat or curved,
 it is 0, and between parallel sheets it is twice their distance.
 

@@ -18,8 +18,9 @@ from .needs import Needs
 from .settings import Settings
 
 # Lobes are followed where kernels behind them make so much of the error. They cost up to a seventh
-# of the time; where half of the error was theirs following them has saved a third of it, and less
-# than its cost where a fifth to three tenths were (docs/performance.md).
+# of the time (thin ellipses a third). Before kernels ended at walls, following them saved a third
+# of the error where half of it was theirs, and less than its cost where a fifth to three tenths
+# were; since then both kinds are equal there (docs/performance.md).
 WORTH_FOLLOWING = 1 / 3
 
 

@@ -9,7 +9,8 @@ the noise is that of w (g − ĝ).
 
 Of the four sides of a pixel ĝ is the darkest, and 0 where nothing is gathered on two of them: at
 edges of dark things w g + (1 − w) ĝ would be far below zero. What remains of that is gone after a
-few samples; sums over passes keep it, pictures of them show it as black.
+few samples; sums over passes and layers keep it, pictures show it as black where nothing else can
+be below zero (see ``film.show``).
 """
 
 from __future__ import annotations

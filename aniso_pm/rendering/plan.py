@@ -7,8 +7,8 @@ that errors are relative,
 
     V_r = k⟨(l_a − l_b)²⟩/2                    of an eye path, without what it gathers,
     V_g = k⟨(g_aA − g_bA)(g_aB − g_bB)⟩/2      of a gather, were there no end of photons,
-    V_gp = k⟨(g_aA − g_bA)²⟩/2 − V_g           of a gather, by the photons that it alone meets,
-    V_p = ⟨(g_aA − g_aB)(g_bA − g_bB)⟩/2       of photons that a pixel's samples share.
+    V_p = ⟨(g_aA − g_aB)(g_bA − g_bB)⟩/2       of photons that a pixel's samples share,
+    V_gp = k(⟨(g_aA − g_aB)²⟩/2 − V_p)         of a gather, by the photons that it alone meets.
 
 A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot)
 has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths

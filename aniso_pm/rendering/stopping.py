@@ -2,9 +2,9 @@
 ``progressive.Run.numbers``').
 
 Time is wall-clock time from the call on, without the compilation of kernels, which happens once, in
-the first pass, and depends on what is cached, and without what callbacks take. Rendering ends as
-near to the limit as whole passes allow: one more begins if, by the mean of the last ones, half of
-it will lie within. The first pass always does.
+the pilot and the first pass, and depends on what is cached, and without what callbacks take.
+Rendering ends as near to the limit as whole passes allow: one more begins if, by the mean of the
+last ones, half of it will lie within. The first pass always does.
 """
 
 from __future__ import annotations

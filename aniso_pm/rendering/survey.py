@@ -54,6 +54,8 @@ from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
 
 # Work of an eye path: of its first ray, of a vertex.
 _CAMERA, _VERTEX = 0.3, 0.4
+# The same vertices of paths that go on after they have left gather points.
+_GOING_ON = 1.15
 # Work of a pass that is not to be exceeded where passes may have any length (see ``Plan.of``): a
 # third of a second.
 _LONGEST = 1.5e6
@@ -62,8 +64,6 @@ _LONGEST = 1.5e6
 _MET_BY_ALL, _ASKED = 2e6, 16
 # Light paths of a map that are left at least.
 _FEWEST = 2000
-# The same vertices of paths that go on after they have left gather points.
-_GOING_ON = 1.15
 # The caustic map has to promise an error smaller than the global one by so much.
 _BETTER = 0.9
 # Path tracing has found the caustics if it has so much of their light, by as many hits, or if they

@@ -168,7 +168,6 @@ def explain(
             take(numbered, mi.UInt32(chosen)),
             radius,
             thickness,
-            outlines,
             probe_seed,
         ),
         outlines=outlines,
@@ -316,7 +315,7 @@ def _kernel(prepared: Prepared, point, radius: float, lost: bool):
         outlines["unguarded"] = outline(bare.s, bare.t)
         la, lb = kernel_axes(path.lobe, path.r, 1.0, "lobe")
         outlines["footprint"] = outline(*project_to_plane(la, lb, path.r, point.n, path.distance))
-        outlines["seen from p0"] = _in_lobe(lobe, np.array(_plain(point.n)), s, t)
+        outlines["seen from p0"] = _in_lobe(lobe, s, t)
     return kernel, lobe, outlines
 
 
@@ -347,7 +346,7 @@ def _ellipse(s, t):
     return np.cos(phi) * s + np.sin(phi) * t
 
 
-def _in_lobe(lobe: Lobe, n, s, t):
+def _in_lobe(lobe: Lobe, s, t):
     """The kernel's outline as directions from where its lobe is (p0, or its mirror image), in the
     lobe's coordinates (v·x, v·y)."""
     v = np.array(lobe.r) * lobe.distance + _ellipse(s, t)
@@ -356,7 +355,7 @@ def _in_lobe(lobe: Lobe, n, s, t):
 
 
 def _photons(
-    prepared: Prepared, map_, point, radius: float, thickness: float, outlines, seed: int
+    prepared: Prepared, map_, point, radius: float, thickness: float, seed: int
 ) -> Photons:
     """Photons in a window around the kernel. seed: of density estimation."""
     plane, _, _ = density.kernels(point, mi.Float(radius), prepared.kernel_options)

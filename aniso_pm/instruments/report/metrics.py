@@ -41,10 +41,6 @@ class Estimate:
     low: float
     high: float
 
-    def excludes(self, value: float) -> bool:
-        """Does the interval lie to one side of ``value``?"""
-        return self.low > value or self.high < value
-
 
 NONE = Estimate(math.nan, math.nan, math.nan)
 

@@ -52,7 +52,7 @@ def of_scene(measured: Measured, plan: Plan) -> dict[str, Any]:
                     "region": region,
                     "budget": budget,
                 }
-                rows.append(place | _row(measured, method, k, region, pair, own[region]))
+                rows.append(place | _row(measured, method, k, pair, own[region]))
                 for base in bases(method, made):
                     other = tables[base.name].get((k, region))
                     if other is not None:
@@ -124,7 +124,7 @@ def _tables(measured: Measured, method: Method, plan: Plan, weight) -> dict[tupl
     return found
 
 
-def _row(measured, method, k, region, pair, own) -> dict[str, Any]:
+def _row(measured, method, k, pair, own) -> dict[str, Any]:
     absolute, relative, energy = pair
     cells = measured.runs[method.name].values()
 

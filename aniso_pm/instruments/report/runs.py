@@ -143,7 +143,7 @@ def recorded(
     each (None: no picture yet, or the method is not denoised)."""
     recorder = _Recorder(budgets, stage.shape)
     if not method.ours:
-        _calls(stage, method, radius, seed, recorder)
+        _calls(stage, method, seed, recorder)
     elif _passes(stage, method, radius, seed, recorder) > _COMPILED * budgets[0]:
         # Pilots of other seeds choose other kernels, which nobody has warmed up: now they are.
         recorder = _Recorder(budgets, stage.shape)
@@ -212,7 +212,7 @@ def _passes(stage: Stage, method: Method, radius, seed: int, recorder: _Recorder
     return compiled
 
 
-def _calls(stage: Stage, method: Method, radius, seed: int, recorder: _Recorder) -> None:
+def _calls(stage: Stage, method: Method, seed: int, recorder: _Recorder) -> None:
     """Calls of one of Mitsuba's integrators, their pictures averaged."""
     integrator, aovs = _mitsubas(stage, method)
     scene, sensor = stage.seen_by(method)

@@ -70,4 +70,3 @@ REGIONS = (
         "gather_points_off_surface",
     ),
 )
-KEYS = {region.key for region in REGIONS}
