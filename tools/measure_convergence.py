@@ -177,6 +177,11 @@ def run(names, photons, spp):
     return results
 
 
+def told(slope):
+    value, low, high = slope
+    return "noise" if np.isnan(value) else f"slope {value:.2f} ({low:.2f} to {high:.2f})"
+
+
 def show(name, result):
     print(f"| {name} | " + " | ".join(f"{n}" for n in result["passes"]) + " | slope |")
     for label in ("MSE", "bias²"):
@@ -185,8 +190,7 @@ def show(name, result):
             f"{v:.2e}" + ("" if clear else " (noise)")
             for v, clear in zip(curve["value"], curve["clear"], strict=True)
         )
-        slope, low, high = curve["slope"]
-        print(f"| {label} | {values} | {slope:.2f} ({low:.2f} to {high:.2f}) |")
+        print(f"| {label} | {values} | {told(curve['slope'])} |")
     print("| energy | " + " | ".join(f"{e:.4f}" for e in result["energy"]) + " | |", flush=True)
 
 
@@ -201,8 +205,7 @@ def plot(results, path):
             value, clear = np.array(curve["value"]), np.array(curve["clear"])
             low, high = np.maximum(curve["interval"], 1e-9)
             ax.fill_between(counts, low, high, color=colour, alpha=0.2, lw=0)
-            slope, a, b = curve["slope"]
-            text = f"{label}: slope {slope:.2f} ({a:.2f} to {b:.2f})"
+            text = f"{label}: {told(curve['slope'])}"
             ax.plot(counts[clear], value[clear], "o-", color=colour, label=text)
             ax.plot(counts[~clear], np.maximum(value[~clear], 1e-9), "o", mfc="w", color=colour)
         guide = result["MSE"]["value"][0] * counts ** (-2 / 3)
