@@ -28,6 +28,14 @@ def own(kind, values: np.ndarray):
     return dr.reshape(kind, array, count, shrink=True)
 
 
+def room(kind, count: int):
+    """Memory for ``count`` entries (a Dr.Jit type), which are not written yet. What is frozen is
+    replayed for any number of them, but traced anew for every size of a ``dr.empty``."""
+    memory = dr.empty(kind, count)
+    dr.make_opaque(memory)
+    return memory
+
+
 def number(kind, value):
     """A number as an array that is no literal: as a literal it would be compiled into kernels, a
     new one for every value. Arrays stay what they are."""

@@ -162,7 +162,7 @@ def test_the_same_light_arrives(variant_llvm_rgb, name):
         """Of all photons, and of those on the plate."""
         map_ = scene.photon_map(seed, 0)
         point = dr.gather(mi.Vector4f, map_.index.points, dr.arange(mi.UInt32, map_.stored))
-        flux = np.array(map_.flux).reshape(map_.stored, -1)[:, :3].mean(1) / map_.emitted
+        flux = np.array(map_.flux).reshape(-1, 4)[: map_.stored, :3].mean(1) / map_.emitted
         plate = (np.abs(np.array(point.y)) < 1e-3).astype(np.float64)
         return np.array([flux.sum(), (flux * plate).sum()])
 

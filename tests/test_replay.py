@@ -1,11 +1,14 @@
 """Paths that are traced in Python once and then replayed are those that it would trace."""
 
+from dataclasses import dataclass
+
 import aniso_pm  # noqa: F401
 import drjit as dr
 import matrix
+import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.rendering import one_pass
+from aniso_pm.rendering import one_pass, replay
 from conftest import slow
 from passes import close, integrator, load, render
 
@@ -65,6 +68,43 @@ def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
     monkeypatch.setattr(one_pass.films, "splat", fail)
     with pytest.raises(RuntimeError, match="cannot be recorded"):
         render(scene, integrator(passes=3), 6)
+
+
+@pytest.mark.with_pilot
+def test_the_first_pass_is_the_last_that_python_traces(monkeypatch):
+    """Whatever the sizes of buffers, and whether time is kept."""
+    stages, recorded = [], []
+    freeze = dr.freeze
+
+    def remembered(function, **options):
+        stages.append(freeze(function, **options))
+        return stages[-1]
+
+    monkeypatch.setattr(dr, "freeze", remembered)
+    plugin = integrator(passes=4, time=1000.0)
+    plugin.callback = lambda *_: recorded.append([stage.n_recordings for stage in stages])
+    render(load(32), plugin, 0)
+    assert plugin.statistics["replayed"] and len(stages) == 3 and len(recorded) == 4
+    assert recorded[0] == recorded[-1]
+
+
+def test_options_are_told_apart():
+    """As ``drjit.freeze`` does not where they differ in a truth value that others have as well."""
+
+    @dataclass
+    class Options:
+        one: bool
+        two: bool
+        three: bool
+        four: str = "four"
+
+    def number(x, options):
+        return x + 4 * options.one + 2 * options.two + options.three
+
+    stage, x = replay.frozen(number), dr.opaque(mi.UInt32, 0, 3)
+    for k in range(8):
+        assert stage(x, Options(bool(k & 4), bool(k & 2), bool(k & 1)))[0] == k
+    assert stage.n_recordings == 8
 
 
 @pytest.mark.slow

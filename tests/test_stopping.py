@@ -39,6 +39,7 @@ def test_compilation_does_not_count_as_rendering(monkeypatch):
         time.sleep(0.05)
         kernel = {"codegen_time": 40.0, "backend_time": 1e5 - 40}
         monkeypatch.setattr(dr, "kernel_history", lambda: [kernel])
+    rules.close()
     assert not dr.flag(dr.JitFlag.KernelHistory)
     assert rules.spent() == pytest.approx(0.05 - 100, abs=0.1)
 
@@ -50,6 +51,7 @@ def test_compilation_before_the_first_pass_does_not_shorten_it(monkeypatch):
     rules.count_compilation()
     with rules.measured():
         time.sleep(0.05)
+    rules.close()
     assert rules._expected_duration() == pytest.approx(0.05, abs=0.04)
     assert rules.compiling == pytest.approx(100)
 

@@ -135,12 +135,12 @@ def test_work_is_counted_once_where_gather_points_need_more_room(variant_llvm_rg
     world = mi.load_dict(room_with_ball(size=16))
     scene = replace(prepare(world, Settings(), False), chosen="survey")
     sensor = world.sensors()[0]
-    tiles = Tiles.of(sensor, COARSE)
     works = []
-    for rooms in ([100_000], [100, 100_000]):  # enough at once; too little at first
-        monkeypatch.setattr(eye, "_rounded_up", lambda _, rooms=rooms: rooms.pop(0))
-        works.append(survey._trace(scene, sensor, tiles, 0).work)
-        assert not rooms
+    for many in (100_000, 100):  # enough at once; too little at first
+        monkeypatch.setattr(eye, "_room_at_first", lambda *_, many=many: many)
+        seen = survey.look(scene, sensor, 0)
+        assert dr.width(seen.points.lane) > 100
+        works.append(seen.work)
     np.testing.assert_array_equal(*works)
 
 

@@ -138,7 +138,9 @@ def indexed(photons: Photons, stored: int, nothing: PhotonMap) -> PhotonMap:
     if origins is not None:
         origins = replace(origins, path=dr.gather(mi.UInt32, _cut(photons, "path", stored), order))
         dr.eval(origins.path)
-    sorted_flux = dr.empty(mi.Float, stored * _flux_width())
+    # As many entries as the index has, so that arrays of all maps are alike in length to what is
+    # frozen, and not by chance in every eighth one.
+    sorted_flux = dr.zeros(mi.Float, dr.width(index.points) // 4 * _flux_width())
     flux = dr.gather(mi.Spectrum, _cut(photons, "flux", stored), order)
     dr.scatter(sorted_flux, pack_flux(flux), dr.arange(mi.UInt32, stored))
     del order, flux

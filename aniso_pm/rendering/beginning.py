@@ -101,7 +101,7 @@ def decide(
     share = shares(settings, spp or sensor.sampler().sample_count(), pixels, controls.first_pass)
     layered = Layered.of(film, settings.layer_names)
     advice.before(scene)
-    film.prepare([])
+    films.begin(film, bool(controls.callback or controls.checkpoint))
 
     # --- What is chosen ---
     # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.

@@ -103,6 +103,15 @@ def to_rgb(spectrum, wavelengths):
     return mi.Color3f(spectrum.x) if mi.is_monochromatic else spectrum
 
 
+def begin(film, shown: bool):
+    """An empty film. shown: pictures are put into it between passes; then it holds a black one from
+    the beginning, because what is frozen is traced anew when a film's memory becomes another."""
+    film.prepare([])
+    if shown:
+        size = film.crop_size()
+        show_array(film, np.zeros((size.y, size.x, film.create_block().channel_count())))
+
+
 def show(film, image):
     """Let the film hold ``image`` (as of :func:`splat`) and nothing else. What is left below zero
     after a few samples (see ``evening``) is black, where nothing but that can be below zero."""

@@ -26,26 +26,13 @@ from .stage_times import Clock
 from .state import COUNTS
 
 
-class _Room:
-    """How many entries a buffer needs. It grows in steps: buffers of another size are traced anew
-    by what is frozen."""
-
-    def __init__(self):
-        self.room = self.most = 0
-
-    def seen(self, count: int):
-        self.most = max(self.most, count)
-        if count > self.room:
-            self.room = count + count // 8
-
-
 class Tracer:
     """Renders one pass after the other.
 
     map, radius  of the last one.
     unfinished   wavefronts so far of the pass that is being rendered; None between passes.
     replayed     are passes traced in Python once and then replayed?
-    photons      of a map, the most so far.
+    photons      of a map, the most so far; _points: gather points of a wavefront.
     """
 
     def __init__(self, decided: Decided, sensor, seed: int, clock: Clock):
@@ -55,11 +42,7 @@ class Tracer:
         self.map: PhotonMap | None = None
         self.radius: float | None = None
         self.unfinished: Traced | None = None
-        self._photons, self._points = _Room(), _Room()
-
-    @property
-    def photons(self) -> int:
-        return self._photons.most
+        self.photons = self._points = 0
 
     def __call__(self, index: int, report: Callable[[int, float], None]) -> Traced:
         """Pass ``index``. report: called with it and the share of it that is done, after every
@@ -82,9 +65,9 @@ class Tracer:
         colour = wavelength_sample(self.seed, index)
         wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
         self.map = self.scene.photon_map(
-            self.seed, index, self._photons.room, wavelengths, self.clock.lap
+            self.seed, index, self.photons, wavelengths, self.clock.lap
         )
-        self._photons.seen(self.map.stored)
+        self.photons = max(self.photons, self.map.stored)
         counts = dict.fromkeys(COUNTS, 0)
         counts["photons_emitted"] = self.map.emitted
         counts["photons_stored"] = self.map.stored
@@ -142,12 +125,12 @@ class Tracer:
             self.map,
             radius,
             random,
-            expected=self._points.room,
+            expected=self._points,
             lap=self.clock.lap,
             even=even,
             for_layers=True,
         )
-        self._points.seen(_count(seen.gathered, counts))
+        self._points = max(self._points, _count(seen.gathered, counts))
 
         # --- Into the image ---
         finite = dr.all(dr.isfinite(seen.L))

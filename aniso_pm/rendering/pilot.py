@@ -96,7 +96,8 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
     count, radius = scene.settings.photon_count, scene.settings.initial_radius
     if scene.undecided:
         scene = replace(scene, chosen="survey")
-    focus = _focus(scene, sensor, seed)
+    seen = survey.look(scene, sensor, seed)
+    focus = _focus(scene, seen.points)
     scene = scene.focused(focus)
     pilot = scene.with_(photon_count=_PATHS)
     maps = [
@@ -110,7 +111,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
         # Nothing says how wide pixels are: one radius for all.
         usual = scene.with_(photon_count=count or USUAL)
         tried = automatic_radius(usual, camera_rays(sensor, seed), seed, maps[0])
-    found = survey.look(scene, sensor, tried or None, seed, each, exactly, maps, count)
+    found = survey.decide(scene, sensor, tried or None, seed, each, exactly, seen, maps, count)
     count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
     # Aimed photons are closer together where they show.
     worth = count / found.aim.variance if found.aim else count
@@ -130,13 +131,10 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
     )
 
 
-def _focus(scene: Prepared, sensor, seed: int) -> Focus | None:
+def _focus(scene: Prepared, points) -> Focus | None:
     """The part of the scene that light from outside is to meet: where eye paths gather, be it
-    behind glass or in a mirror."""
-    if not (scene.needs_map and scene.emission and scene.emission.from_outside):
-        return None
-    points = _gather_points(scene, camera_rays(sensor, seed), seed)
-    if points is None:
+    behind glass or in a mirror. points: GatherPoints or None."""
+    if points is None or not (scene.emission and scene.emission.from_outside):
         return None
     return find(np.array(points.p).T.astype(np.float64), 0.5 * scene.extent)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -20,7 +19,7 @@ from ..transport.aim import Aim
 from ..transport.amends import repair_bounds
 from ..transport.focus import Focus
 from ..transport.walk import WalkOptions
-from . import gathering
+from . import gathering, replay
 from .decisions import Decisions
 from .evening import Evening
 from .footprint import Footprint
@@ -98,10 +97,8 @@ class Prepared(Decisions):
         # Scenes that nobody uses any more must not vanish while Dr.Jit records this one: their
         # materials are part of the same virtual function calls.
         gc.collect()
-        # A pilot asks for more kinds of gathers than Dr.Jit finds normal.
-        freeze = partial(dr.freeze, warn_after=1000)
         stages = photons.light_paths, eye.eye_paths, gathering.gather
-        return replace(self, launch=Launch(*map(freeze, stages)))
+        return replace(self, launch=Launch(*map(replay.frozen, stages)))
 
     def photon_map(
         self,

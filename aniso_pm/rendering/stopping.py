@@ -35,7 +35,8 @@ class Stopping:
         self._compiling = 0.0
         self._elsewhere = 0.0
         self._durations: list[float] = []
-        # A history that the caller keeps is the caller's; then compilation counts as rendering.
+        # A history that the caller keeps is the caller's; then compilation counts as rendering. It
+        # is kept to the end: Dr.Jit traces what is frozen anew whenever one of its flags changes.
         self._history = settings.time > 0 and not dr.flag(dr.JitFlag.KernelHistory)
         if self._history:
             dr.kernel_history_clear()
@@ -46,8 +47,10 @@ class Stopping:
         """Around each pass."""
         began, aside = time.perf_counter(), self._compiling + self._elsewhere
         yield
-        if self._history:
-            self._close_history()
+        if self._durations:
+            self._forget_history()
+        else:
+            self.count_compilation()
         took = time.perf_counter() - began - (self._compiling + self._elsewhere - aside)
         self._durations = [*self._durations[-_RECENT + 1 :], took]
 
@@ -62,20 +65,20 @@ class Stopping:
 
     def close(self):
         """At the end, however it came."""
+        self._forget_history()
         if self._history:
-            self._close_history()
+            dr.set_flag(dr.JitFlag.KernelHistory, False)
 
     def count_compilation(self):
         """What has been compiled so far is no rendering."""
         if self._history:
             kernels = [k for k in dr.kernel_history() if "backend_time" in k]
             self._compiling += sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
-            dr.kernel_history_clear()
+            self._forget_history()
 
-    def _close_history(self):
-        self.count_compilation()
-        dr.set_flag(dr.JitFlag.KernelHistory, False)
-        self._history = False
+    def _forget_history(self):
+        if self._history:
+            dr.kernel_history_clear()
 
     @property
     def compiling(self) -> float:

@@ -102,25 +102,83 @@ class Survey:
     points: Any
 
 
-def look(
-    scene: Prepared, sensor, radius, seed: int, each: int, exactly: bool, maps, light_paths
+@dataclass(frozen=True)
+class Seen:
+    """What the pairs of eye paths saw, as (pairs, 2) but work, early (pairs).
+
+    own      light that every use leaves to eye paths.
+    later    light that the global map has, the caustic one not.
+    caustic  light that both have.
+    work     of the whole path; early: of the path up to its first gathered part.
+    points   where they gather, or None.
+    tiles    of the pairs.
+    """
+
+    own: np.ndarray
+    later: np.ndarray
+    caustic: np.ndarray
+    work: np.ndarray
+    early: np.ndarray
+    points: Any
+    tiles: Tiles
+
+
+def look(scene: Prepared, sensor, seed: int) -> Seen:
+    """Trace the pairs. scene: as for ``decide``."""
+    tiles = Tiles.of(sensor, COARSE)
+    sampler, ray, _, _ = _pairs(sensor, tiles, seed, PILOT_PAIRS)
+    scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
+    vertices = early = mi.Float(0)
+
+    def watch():
+        nonlocal vertices, early
+        vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
+
+        def see(lane, depth, si, bsdf, bs, active, scattered):
+            dr.scatter_add(vertices, mi.Float(1), lane, active)
+            dr.scatter_add(early, mi.Float(1), lane, active & ~scattered)
+
+        return see
+
+    room = 3 * tiles.lanes if scene.use == "survey" else 0
+    L, _, points = scene.trace(sampler, ray, room, watch=watch)
+    later = caustic = mi.Float(0)
+    if isinstance(L, Parts):
+        L, later, caustic = L.radiance, L.later, L.caustic
+    none = dr.zeros(mi.Float, tiles.lanes)
+    later, caustic = _pairwise(later + none), _pairwise(caustic + none)
+    own = _pairwise(channel_mean(L) + none) - later
+    work, early = (_VERTEX * _pairwise(v).mean(1) + _CAMERA for v in (vertices, early))
+    return Seen(own, later, caustic, work, early, points, tiles)
+
+
+def decide(
+    scene: Prepared,
+    sensor,
+    radius,
+    seed: int,
+    each: int,
+    exactly: bool,
+    seen: Seen,
+    maps,
+    light_paths,
 ) -> Survey:
-    """Trace the pairs, and decide.
+    """What follows from what the pairs saw and what they read.
 
     scene        where the use of the map is open: with ``chosen`` "survey".
     radius       bandwidth of the first pass, world units, if it is given: all kernels have it.
     each, exactly  see ``pilot.settle``.
+    seen         by the pairs (see ``look``).
     maps         two independent photon maps of as many light paths, or empty ones.
     light_paths  of a pass if they are given, else 0 or None.
     """
-    tiles = Tiles.of(sensor, COARSE)
-    seen = _trace(scene, sensor, tiles, seed)
+    tiles = seen.tiles
     read = partial(_read, scene, sensor, radius, seed, tiles)
     filtered = noise_share(sensor.film())
     longest = math.inf if exactly or scene.settings.passes else _LONGEST
     # What uses are compared after: the work of path tracing, whatever the length of their passes.
     total = PASSES * each * tiles.pixels * float(seen.work.mean())
-    decide = partial(
+    plan_of = partial(
         Plan.of,
         longest,
         each,
@@ -137,7 +195,7 @@ def look(
             use = "none" if scene.photons_are_dispensable else "caustic"
         light = seen.own + seen.later + (0 if use == "caustic" else seen.caustic)
         weight = tiles.weight(light)
-        plan = decide(use=use, weight=weight, v_own=within(light, light, weight))
+        plan = plan_of(use=use, weight=weight, v_own=within(light, light, weight))
         return _survey(plan, {}, pixel_counts(plan, scene, sensor, seed), None, None)
     own = seen.own
     weigh = lambda gathered: tiles.weight(own + gathered)  # noqa: E731
@@ -145,7 +203,7 @@ def look(
         found = read(maps, seen.points, weigh)
         weight = weigh(found.light)
         v_own = within(own, own, weight)
-        plan = decide(use=scene.use, weight=weight, v_own=v_own, found=found)
+        plan = plan_of(use=scene.use, weight=weight, v_own=v_own, found=found)
         return _survey(plan, {}, pixel_counts(plan, scene, sensor, seed), maps[0], seen.points)
 
     # --- The global map ---
@@ -153,21 +211,21 @@ def look(
     found = read(maps, first, weigh)
     weight = weigh(found.light)
     v_own = within(own, own, weight)
-    decide = partial(decide, weight=weight)
-    best = decide(use="global", v_own=v_own, found=found, work=seen.early)
+    plan_of = partial(plan_of, weight=weight)
+    best = plan_of(use="global", v_own=v_own, found=found, work=seen.early)
     errors: dict[str, float | None] = {"global": best.error}
     chosen: tuple[Any, Any] = maps[0], first
 
     # --- The other ones, unless their eye paths alone are too dear ---
     light = own + seen.later
     more = within(light, light, weight) - v_own
-    bare = decide(use="none", v_own=v_own, later=more)
+    bare = plan_of(use="none", v_own=v_own, later=more)
     if bare.error < best.error:
         maps = [caustics(map_) for map_ in maps]
         any_ = replace(seen.points, caustic=dr.opaque(mi.Bool, False, dr.width(seen.points.lane)))
         found = read(maps, any_, lambda _: weight)
         work = _GOING_ON * seen.work
-        plan = decide(use="caustic", v_own=v_own, found=found, later=more, work=work)
+        plan = plan_of(use="caustic", v_own=v_own, found=found, later=more, work=work)
         errors["caustic"] = plan.error
         if plan.error < _BETTER * best.error:
             best, chosen = plan, (maps[0], any_)
@@ -176,7 +234,7 @@ def look(
             if _has_found(seen.caustic, found.light, weight):
                 light = light + seen.caustic
                 more = within(light, light, weight) - v_own
-                plan = decide(use="none", v_own=v_own, later=more)
+                plan = plan_of(use="none", v_own=v_own, later=more)
                 errors["none"] = plan.error
                 if plan.error < best.error:
                     best, chosen = plan, (None, None)
@@ -210,14 +268,15 @@ def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray |
         return None
     fine, coarse = Tiles.of(sensor, FINE), plan.tiles
     sampler, ray, pixel, sample = _pairs(sensor, fine, seed, PILOT_FINE)
-    # Traced as in the passes, by the same compiled kernel.
+    # Traced as in the passes, which replay what is recorded here.
     scene = replace(scene, chosen=plan.use, lobes_matter=scene.worth_following(plan.lobes))
     scene = replace(scene, footprint=footprint.of(sensor, 1.0))
     few = dr.opaque(mi.Float, LEAST_SHARE, fine.lanes // SAMPLES)
     thinning = None
     if plan.share.min() < 1:
         each = dr.opaque(mi.UInt32, SAMPLES, fine.lanes)
-        thinning = Thinning.of_pass(few, seed, pixel, sample, each)
+        place = sample + dr.opaque(mi.UInt32, 0)  # not the sampler's own variable: as in passes
+        thinning = Thinning.of_pass(few, seed, pixel, place, each)
     L, _, _ = scene.trace(sampler, ray, thinning=thinning)
     own = _pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
     weight = fine.weight(own + coarse.refined(plan.gathered, fine)[:, None])
@@ -233,53 +292,8 @@ def _pairs(sensor, tiles: Tiles, seed: int, stream: int):
     pixel, sample = lane // SAMPLES, lane % SAMPLES
     sampler.begin(stream_seed(seed, PILOT, stream), pixel, sample)
     ray, _ = rays_through(sensor, sampler, tiles.positions(sensor, seed, sampler), 0.5)
+    dr.eval(ray)  # as in passes
     return sampler, ray, pixel, sample
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """What the pairs of eye paths saw, as (pairs, 2) but work, early (pairs).
-
-    own      light that every use leaves to eye paths.
-    later    light that the global map has, the caustic one not.
-    caustic  light that both have.
-    work     of the whole path; early: of the path up to its first gathered part.
-    points   where they gather, or None.
-    """
-
-    own: np.ndarray
-    later: np.ndarray
-    caustic: np.ndarray
-    work: np.ndarray
-    early: np.ndarray
-    points: Any
-
-
-def _trace(scene: Prepared, sensor, tiles: Tiles, seed: int) -> _Seen:
-    sampler, ray, _, _ = _pairs(sensor, tiles, seed, PILOT_PAIRS)
-    scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
-    vertices = early = mi.Float(0)
-
-    def watch():
-        nonlocal vertices, early
-        vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
-
-        def see(lane, depth, si, bsdf, bs, active, scattered):
-            dr.scatter_add(vertices, mi.Float(1), lane, active)
-            dr.scatter_add(early, mi.Float(1), lane, active & ~scattered)
-
-        return see
-
-    room = 3 * tiles.lanes if scene.use == "survey" else 0
-    L, _, points = scene.trace(sampler, ray, room, watch=watch)
-    later = caustic = mi.Float(0)
-    if isinstance(L, Parts):
-        L, later, caustic = L.radiance, L.later, L.caustic
-    none = dr.zeros(mi.Float, tiles.lanes)
-    later, caustic = _pairwise(later + none), _pairwise(caustic + none)
-    own = _pairwise(channel_mean(L) + none) - later
-    work, early = (_VERTEX * _pairwise(v).mean(1) + _CAMERA for v in (vertices, early))
-    return _Seen(own, later, caustic, work, early, points)
 
 
 def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points, weigh) -> Found:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .. import arrays
 from ..map.gather_points import GatherPoints, map_tree, take
 from ..map.index import curve_order
 from .walk import Vertex, WalkOptions, first_lobe, walk
@@ -27,13 +28,10 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
         L, valid, _, _ = launch(scene, sampler.clone(), ray, options, None, None, None)
         dr.eval(L, valid)
         return L, valid, None
-    # Without mixed receivers a path ends where it leaves its first gather point.
-    single = options.use == "global" and not options.general
-    capacity = dr.width(ray) if single else max(2 * dr.width(ray), expected + expected // 8)
+    capacity = _room_at_first(options, dr.width(ray), expected)
     while True:
-        capacity = _rounded_up(capacity)
         rows, room = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, capacity)
-        points = map_tree(lambda v: dr.empty(type(v), capacity), _blank(options))  # noqa: B023
+        points = map_tree(lambda v: arrays.room(type(v), capacity), _blank(options))  # noqa: B023
         L, valid, rows, points = (launch or eye_paths)(
             scene, sampler.clone(), ray, options, rows, points, room
         )
@@ -49,11 +47,11 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
     return L, valid, take(points, curve_order(position))
 
 
-def _rounded_up(capacity: int) -> int:
-    """By an eighth at most, so that wavefronts of about the same size have columns of the same:
-    what is frozen is traced anew for every other one."""
-    step = 1 << max(capacity.bit_length() - 4, 0)
-    return -(-capacity // step) * step
+def _room_at_first(options: WalkOptions, paths: int, expected: int) -> int:
+    """Entries of the columns of gather points."""
+    # Without mixed receivers a path ends where it leaves its first gather point.
+    single = options.use == "global" and not options.general
+    return paths if single else max(2 * paths, expected + expected // 8)
 
 
 def eye_paths(scene, sampler, ray, options: WalkOptions, rows, points, room, see=None):

@@ -31,6 +31,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import arrays
 from ..map import index as spatial
 from ..map.photon_map import Origins, PhotonMap, Photons, indexed
 from ..map.photon_word import SEGMENTS_MAX, encode, encode_normal
@@ -118,11 +119,11 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefro
     while True:
         capacity = max(capacity + capacity // 16, 1024)
         photons = Photons(
-            dr.empty(mi.Point3f, capacity),
-            dr.empty(mi.UInt32, capacity),
-            dr.empty(mi.Spectrum, capacity),
-            dr.empty(mi.UInt32, capacity) if options.general else None,
-            dr.empty(mi.UInt32, capacity) if options.remember else None,
+            arrays.room(mi.Point3f, capacity),
+            arrays.room(mi.UInt32, capacity),
+            arrays.room(mi.Spectrum, capacity),
+            arrays.room(mi.UInt32, capacity) if options.general else None,
+            arrays.room(mi.UInt32, capacity) if options.remember else None,
         )
         stored, rejected = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0)
         room = dr.opaque(mi.UInt32, capacity)

@@ -190,7 +190,7 @@ def _passes(stage: Stage, method: Method, radius, seed: int, recorder: _Recorder
             # What the integrator does before its own clock begins.
             prepare = time.perf_counter() - began - sum(stages.values())
             compiled = _compilation()
-            dr.set_flag(dr.JitFlag.KernelHistory, recording)
+        dr.kernel_history_clear()  # kept on: what is frozen is traced anew where a flag changes
         stages = {"prepare": prepare, **stages}
         recorder.run.radius = statistics["initial_radius"]
         layers = dict(integrator.layers) if method.denoised else None
