@@ -155,7 +155,7 @@ def estimate(
             given = channel_mean(light * points.weight) * unit
             score = scores[1] * dr.square(given)
             # Directly: sums of each thread's own would have their size in the code.
-            dr.scatter_add(scores[0], score, slot, inside, mode=dr.ReduceMode.Direct)
+            dr.scatter_add(scores[0], score, slot, inside & (score > 0), mode=dr.ReduceMode.Direct)
         # Kahan's sum: what rounding took from the total goes into the next term. A plain sum is
         # off by 1 % after a million equal photons.
         term = light - missing

@@ -303,19 +303,23 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
     kernels = [_kernels(scene, sensor, radius, width) for width in (NARROW, WIDE)]
     asked = take(points, dr.arange(mi.UInt32, -(-dr.width(points.lane) // _ASKED)) * _ASKED)
     dr.eval(asked)  # so that the kernel is that of all points
-    _, _, few = _gathered(*kernels[0], seed, asked, colours, lanes, maps[0], None)
+    # Scored without weight: one kernel serves all gathers.
+    unweighted = dr.opaque(mi.Float, 0, lanes)
+    few = _gathered(
+        *kernels[0], seed, asked, colours, lanes, maps[0], _scores(maps[0], unweighted)
+    )[2]
     most = few * _ASKED * lanes * (1 if radius else (WIDE / NARROW) ** 2)
     if most > _MET_BY_ALL:
         left = int(maps[0].emitted * _MET_BY_ALL / most)
         maps = [thinned(map_, max(left, _FEWEST)) for map_ in maps]
 
     found: list[Any] = []
-    scores: list[Any] = [None, None]
+    weight = unweighted
     for scene_, size in kernels:
         if found:
             weight = weigh(0.5 * (found[0][0][0] + found[0][1][0]))
             weight = arrays.own(mi.Float, np.repeat(weight, 2 * SAMPLES).astype(np.float32))
-            scores = [(dr.opaque(mi.Float, 0, max(map_.stored, 1)), weight) for map_ in maps]
+        scores = [_scores(map_, weight) for map_ in maps]
         gather = partial(_gathered, scene_, size, seed, points, colours, lanes)
         found.append([gather(*each) for each in zip(maps, scores, strict=True)])
     (a, over_lobes, met), (b, _, _) = found[0]
@@ -324,6 +328,11 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
     learned = _learned(maps, [column for column, _ in scores])
     emitted, stored = maps[0].emitted, maps[0].stored
     return Found(a, b, wide_a, wide_b, over_lobes, met, each, emitted, stored, learned)
+
+
+def _scores(map_: PhotonMap, weight):
+    """As ``Prepared.gather`` has them."""
+    return dr.opaque(mi.Float, 0, max(map_.stored, 1)), weight
 
 
 def _kernels(scene: Prepared, sensor, radius, width: float) -> tuple[Prepared, float]:
