@@ -70,22 +70,35 @@ def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
         render(scene, integrator(passes=3), 6)
 
 
-@pytest.mark.with_pilot
-def test_the_first_pass_is_the_last_that_python_traces(monkeypatch):
-    """Whatever the sizes of buffers, and whether time is kept."""
-    stages, recorded = [], []
-    freeze = dr.freeze
+@pytest.fixture
+def stages(monkeypatch):
+    """What is frozen: light paths, eye paths, gathers."""
+    frozen, freeze = [], dr.freeze
 
     def remembered(function, **options):
-        stages.append(freeze(function, **options))
-        return stages[-1]
+        frozen.append(freeze(function, **options))
+        return frozen[-1]
 
     monkeypatch.setattr(dr, "freeze", remembered)
+    return frozen
+
+
+@pytest.mark.with_pilot
+def test_the_first_pass_is_the_last_that_python_traces(stages):
+    """Whatever the sizes of buffers, and whether time is kept."""
+    recorded = []
     plugin = integrator(passes=4, time=1000.0)
     plugin.callback = lambda *_: recorded.append([stage.n_recordings for stage in stages])
     render(load(32), plugin, 0)
     assert plugin.statistics["replayed"] and len(stages) == 3 and len(recorded) == 4
     assert recorded[0] == recorded[-1]
+
+
+@pytest.mark.with_pilot
+def test_passes_replay_the_eye_paths_of_the_pilot(stages):
+    plugin = mi.load_dict({"type": "aniso_pm", "map": "global", "passes": 2})
+    render(load(32), plugin, 2 * 32)
+    assert plugin.statistics["share_of_gathers"] < 1 and stages[1].n_recordings == 1
 
 
 def test_options_are_told_apart():
