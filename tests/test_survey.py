@@ -234,9 +234,11 @@ def test_path_tracing_has_found_caustics_by_many_hits_or_where_there_are_next_to
     assert not survey._has_found(0 * many, 5e-3 * there, weight)
 
 
-def test_gathers_of_a_pilot_are_recorded_once(variant_llvm_rgb):
-    """Whatever the width of kernels, map and points, and whether photons are scored."""
-    scene = mi.load_dict(room_with_ball(size=24))
+@pytest.mark.parametrize("make", [room, room_with_ball])
+def test_gathers_of_a_pilot_are_recorded_once(variant_llvm_rgb, make):
+    """Whatever the width of kernels, map and points, whether photons are scored, and whether every
+    eye path ends at a gather point, as in a room with nothing but diffuse walls."""
+    scene = mi.load_dict(make(size=24))
     prepared = prepare(scene, Settings(map="global"), False).frozen()
     pilot.settle(prepared, scene.sensors()[0], 0, 16)
     assert prepared.launch.gather.n_recordings == 1

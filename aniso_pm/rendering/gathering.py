@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 
 from ..map import density, walls
@@ -74,11 +73,9 @@ def gather(
     map_         PhotonMap, its numbers as arrays (``PhotonMap.numbered``).
     radius       bandwidth of the pass, world units; seed: of random numbers. Both Dr.Jit arrays.
     wavelengths  nm, of the eye paths, in spectral variants.
-    scores       see ``density.estimate``, with the weight of each eye path.
+    scores       see ``density.estimate``.
     """
     o = options
-    if scores is not None:
-        scores = scores[0], dr.gather(mi.Float, scores[1], points.lane)
     surface = None
     if o.roughness is not None:
         surface = density.Surface.at(scene, points, o.roughness, wavelengths)

@@ -202,8 +202,13 @@ class Prepared(Decisions):
 
         def gather(some, roughness=None):
             options = replace(o, roughness=roughness)
+            scored = None
+            if scores:
+                # A weight for each point: Dr.Jit traces anew where sizes of arrays coincide or not.
+                scored = scores[0], dr.gather(mi.Float, scores[1], some.lane)
+                dr.eval(scored[1])
             found = self.launch.gather(
-                self.scene, map_, radius, seed, some, self.footprint, wavelengths, scores, options
+                self.scene, map_, radius, seed, some, self.footprint, wavelengths, scored, options
             )
             # One kernel for all of it: a reduction by itself would run the whole gather again.
             dr.eval(found)
