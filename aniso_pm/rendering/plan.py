@@ -199,8 +199,8 @@ class Plan:
         for _ in range(_ROUNDS):
             b_1 = aimed * noise.by_photons(share * each, choose)
             if choose:
-                left = PASSES * paths
-                widths = kernel_widths(tiles, b_1, noise.change, left, price * share).ravel()
+                all_paths = PASSES * paths
+                widths = kernel_widths(tiles, b_1, noise.change, all_paths, price * share).ravel()
                 area = (widths / NARROW) ** 2
             else:
                 area = np.ones(len(whole))
