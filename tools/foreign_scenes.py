@@ -36,6 +36,7 @@ USES = {
     "final gather": {"final_gather": True},
 }
 ROUNDS = 8  # independent renders, whose scatter is the standard error
+TRIES = 8  # numbers of samples that are tried for one that takes the given time
 
 
 # --- One scene ---
@@ -69,13 +70,14 @@ def samples_for(scene, plugin, seconds, seed):
     """Samples a pixel that take so long, kernels compiled and what a render costs once included."""
     spp = 4
     picture(scene, plugin, spp, seed)
-    while True:
+    for _ in range(TRIES):
         start = time.perf_counter()
         picture(scene, plugin, spp, seed)
-        took = time.perf_counter() - start
-        if took > 0.4 * seconds:
-            return max(4, int(spp * seconds / took))
-        spp = int(spp * np.clip(0.7 * seconds / took, 2, 16))
+        share = (time.perf_counter() - start) / seconds
+        if 0.9 < share < 1.1:
+            break
+        spp = max(4, int(spp / np.clip(share, 1 / 16, 16)))
+    return spp
 
 
 def renders(scene, parameters, seconds, seed):
