@@ -158,10 +158,11 @@ def run(file, arguments):
         done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     except subprocess.TimeoutExpired:
         return {"failed": "took longer than ten minutes"}
-    warned = re.findall(r"aniso_pm: (.*?)(?:\x1b|$)", done.stdout + done.stderr, re.MULTILINE)
-    last = [line for line in done.stdout.splitlines() if line.startswith("{")]
+    printed, errors = (re.sub(r"\x1b\[\d*m", "", text) for text in (done.stdout, done.stderr))
+    warned = re.findall(r"aniso_pm: (.*)", printed + errors)
+    last = [line for line in printed.splitlines() if line.startswith("{")]
     if not last:
-        lines = [line for line in done.stderr.splitlines() if line.strip()]
+        lines = [line for line in errors.splitlines() if line.strip()]
         return {"failed": lines[-1] if lines else f"exit status {done.returncode}"}
     row = json.loads(last[-1])
     known = " ".join(row["refused"])
