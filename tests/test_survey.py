@@ -261,15 +261,18 @@ def test_light_paths_of_one_sample_a_pixel_make_no_long_pass(monkeypatch, light,
     assert plan.Plan.of(1.5e6, 1, light_paths=given).light_paths == pytest.approx(paths)
 
 
-def test_path_tracing_has_found_caustics_by_many_hits_or_where_there_are_next_to_none():
+def test_path_tracing_has_found_caustics_by_hits_or_where_there_are_next_to_none():
     weight, there = np.ones(1000), np.full((1000, 2), 0.1)
     many, few = np.zeros((1000, 2)), np.zeros((1000, 2))
     many[:200, 0], few[:20, 0] = 1.0, 10.0  # the light of the map, by 200 hits and by 20
-    assert survey._has_found(many, there, weight)
-    assert not survey._has_found(few, there, weight)
-    assert not survey._has_found(0.5 * many, there, weight)
-    assert survey._has_found(0 * many, 5e-4 * there, weight)
-    assert not survey._has_found(0 * many, 5e-3 * there, weight)
+    assert survey._doubt(many, there, weight) == 1
+    assert survey._doubt(few, there, weight) == pytest.approx(64 / 20)
+    fewest = np.zeros((1000, 2))
+    fewest[:7, 0] = 200 / 7
+    assert survey._doubt(fewest, there, weight) is None
+    assert survey._doubt(0.5 * many, there, weight) is None
+    assert survey._doubt(0 * many, 5e-4 * there, weight) == 1
+    assert survey._doubt(0 * many, 5e-3 * there, weight) is None
 
 
 @pytest.mark.parametrize("make", [room, room_with_ball])

@@ -67,8 +67,9 @@ _FEWEST = 2000
 # The caustic map has to promise an error smaller than the global one by so much.
 _BETTER = 0.9
 # Path tracing has found the caustics if it has so much of their light, by as many hits, or if they
-# are less than such a share of the picture's light.
-_FOUND, _HITS, _NOTHING = 0.7, 64, 1e-4
+# are less than such a share of the picture's light. With fewer than the last number of hits their
+# variance is taken to be larger than it looks.
+_FOUND, _FEWEST_HITS, _NOTHING, _HITS = 0.7, 8, 1e-4, 64
 
 
 @dataclass(frozen=True)
@@ -231,9 +232,11 @@ def decide(
             best, chosen = plan, (maps[0], any_)
         if scene.photons_are_dispensable:
             errors["none"] = None
-            if _has_found(seen.caustic, found.light, weight):
+            doubt = _doubt(seen.caustic, found.light, weight)
+            if doubt:
                 light = light + seen.caustic
-                more = within(light, light, weight) - v_own
+                with_caustics = within(light, light, weight) - v_own
+                more = more + doubt * (with_caustics - more)
                 plan = plan_of(use="none", v_own=v_own, later=more)
                 errors["none"] = plan.error
                 if plan.error < best.error:
@@ -361,15 +364,19 @@ def _learned(maps, columns) -> aim.Learned | None:
     return aim.learn(numbers, np.array(scores), work, photons_left)
 
 
-def _has_found(caustic, light, weight) -> bool:
-    """Have eye paths found the caustics of the map, by enough hits, or are these next to none?"""
+def _doubt(caustic, light, weight) -> float | None:
+    """By what to multiply the variance that caustics are seen to have in path tracing: what rarely
+    hits is noisier than a few hits tell. None where too little was found to tell; 1 where there is
+    next to nothing. caustic: found by eye paths; light: of the map."""
     root = np.sqrt(weight)[:, None]
     hits, there = (caustic * root).ravel(), float((light * root).mean())
     if there < _NOTHING:
-        return True
+        return 1.0
     squares = float((hits**2).sum())
-    enough = squares == 0 or float(hits.sum()) ** 2 >= _HITS * squares
-    return enough and float(hits.mean()) >= _FOUND * there
+    as_many = float(hits.sum()) ** 2 / squares if squares else 0.0
+    if as_many < _FEWEST_HITS or float(hits.mean()) < _FOUND * there:
+        return None
+    return max(1.0, _HITS / as_many)
 
 
 def _gathered(scene, radius, seed, points, colours, lanes, map_, scores):
