@@ -7,12 +7,12 @@ How variances become decisions is told in ``plan``.
 *Use of the map.* Where it is open (``Prepared.undecided``), the eye paths of the pilot go on as in
 path tracing and tell apart what each use leaves to them (see ``survey_parts``). That of the least
 
-    bias² + (A/n + B/N) (n P (C + q C_g) + N C_p) / (M n P C_0)
+    bias² + V T / (M n P C_0)
 
 is chosen, its error after the work of M passes of path tracing, C_0 for each path. Path tracing
 finds some caustics by rare hits that a pilot may miss, so that their variance seems small; it is
-chosen only where it has found the caustics that the map holds, by many hits, or where these are
-next to none.
+chosen only where it has found the caustics that the map holds, their variance taken to be the
+larger the fewer hits they were, or where these are next to none.
 """
 
 from __future__ import annotations
