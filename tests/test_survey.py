@@ -48,9 +48,9 @@ def test_it_is_a_function_of_scene_and_seed(variant_llvm_rgb):
 
 
 def test_more_samples_ask_for_more_light_paths(variant_llvm_rgb):
-    """Not in proportion: each of them meets the photons of all. But kernels shrink as well."""
+    """More than in proportion: kernels shrink as there are more of them."""
     few, many = (settled(room_with_ball(size=24), each, map="global")[0] for each in (128, 512))
-    assert 2 * few.count < many.count < 4 * few.count
+    assert many.count > 3.5 * few.count
 
 
 def test_lobes_are_followed_where_kernels_behind_them_matter(variant_llvm_rgb):
@@ -88,44 +88,6 @@ def test_kernels_are_wide_where_light_is_smooth_and_narrow_at_an_edge():
     bias2 = (0.04 + tiles.uncertainty(change.ravel())[:, 28]) / (2**1.5 - 1) ** 2
     w = widths[:, 28]
     np.testing.assert_allclose(bias2 * (w / 4) ** 3, 2 / 3 * 2e5 / (16e5 * w**2), rtol=1e-6)
-
-
-@pytest.mark.parametrize("given", [0, 1e4])
-def test_decisions_make_the_error_after_equal_work_smallest(monkeypatch, given):
-    """Where light and its noise are alike everywhere, neither other numbers of light paths nor
-    other widths of kernels promise less.  given: light paths."""
-    tiles = Tiles(2, 64, 48)
-    pairs = tiles.across * tiles.down
-    light = [[1.5, 1.1], [0.9, 0.7], [1.1, 0.7], [0.8, 0.5], [0.0, 0.0]]
-    light = [np.tile(each, (pairs, 1)) for each in light]
-    found = plan.Found(*light, met=600.0, points=1.0, emitted=100_000, stored=80_000, aim=None)
-    kernel_widths = plan.kernel_widths
-    # Which is there for safety's sake.
-    monkeypatch.setattr(Tiles, "uncertainty", lambda *_: 0.0)
-
-    def planned(total, light_paths=given, wider=1.0):
-        monkeypatch.setattr(plan, "kernel_widths", lambda *a: wider * kernel_widths(*a))
-        return plan.Plan._of(
-            8,
-            tiles=tiles,
-            choose=True,
-            light_paths=light_paths,
-            filtered=0.5,
-            total=total,
-            whole=np.full(pairs, 1.2),
-            use="global",
-            weight=np.ones(pairs),
-            v_own=np.full(pairs, 0.02),
-            found=found,
-        )
-
-    total = plan.PASSES * planned(1.0).work
-    best = planned(total)
-    assert plan._THINNEST < best.widths.mean() < plan._WIDEST
-    for change in (0.8, 1.25):
-        assert planned(total, best.light_paths, change).error > best.error
-        if not given:
-            assert planned(total, change * best.light_paths).error > best.error
 
 
 @pytest.mark.parametrize("edge", [1, 3])

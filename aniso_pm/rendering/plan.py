@@ -11,12 +11,11 @@ that errors are relative,
     V_gp = k(⟨(g_aA − g_aB)²⟩/2 − V_p)         of a gather, by the photons that it alone meets.
 
 A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot)
-has the variance V = A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths
+has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths
 being what the film's filter leaves of it, that of shared photons the root of it), and costs
-T = n P (C + q (C_g + N C_m)) + N C_p, P the number of pixels and N C_m that of the photons that a
-gather meets. For given n, variance times cost is smallest at
+n P (C + q C_g) + N C_p, P the number of pixels. For given n, variance times cost is smallest at
 
-    q² = C (V_g + V_gp)/(V_r (C_g + N C_m)),    N² = n² P (C + q C_g) B/(A (C_p + n P q C_m)),
+    q² = C (V_g + V_gp)/(V_r C_g),        N² = n² P (C + q C_g) B / (A C_p),
 
 and with samples of a pixel in proportion to √((V_r + (V_g + V_gp)/q)/C) there, C the work of an eye
 path of that pixel. Costs are counted, not timed, so that every machine decides alike.
@@ -26,14 +25,10 @@ path of that pixel. Costs are counted, not timed, so that every machine decides 
 in it: its mean is the square of what bias changes from 4 to 8 pixels. Bias grows as w² where light
 is smooth and as √w in the mean around an edge; between them, as w^1.5,
 
-    bias²(w) = b w³ = ⟨D D'⟩ (w/4)³/(2^1.5 − 1)².
+    bias²(w) = ⟨D D'⟩ (w/4)³/(2^1.5 − 1)²,    so    w⁵ = 2 B₁/(3 M N) · 4³ (2^1.5 − 1)²/⟨D D'⟩
 
-Wider kernels meet more photons, as w²: work that would lower the variance V/M of M = 32 passes by
-c w² V/M, c w² = n P q N C_m/T. So bias² + B₁/(w² M N) + c w² V/M is smallest at
-
-    3 b w⁵ + (2 c V/M) w⁴ = 2 B₁/(M N).
-
-Means are taken over tiles and their neighbours.
+makes bias² + B₁/(w² M N) smallest after M = 32 passes. Means are taken over tiles and their
+neighbours.
 """
 
 from __future__ import annotations
@@ -62,8 +57,6 @@ _GATHER, _MET, LIGHT_PATH, LEFT = 2.0, 1 / 30, 0.6, 0.4
 # Variance of an eye sample among a few hundred stratified ones, as a share of that among SAMPLES:
 # 0.59 among 52 and falling, in direct light.
 STRATIFIED = 0.45
-# Steps of Newton's method to a width of kernels, which leave less than a millionth of it.
-_NEWTON = 4
 # Rounds in which the decisions, each of which depends on the others, settle.
 _ROUNDS = 4
 # Variance beyond the first gathered part, where stratification does less, as such a share.
@@ -194,34 +187,29 @@ class Plan:
         light, met, aimed = LIGHT_PATH + LEFT * found.stored / found.emitted, found.met, 1.0
         if found.aim:
             light, met, aimed = light * found.aim.work, met * found.aim.photons, found.aim.variance
-        met *= _MET / found.emitted  # for each light path, through NARROW kernels
-        price = 0.0
         for _ in range(_ROUNDS):
             b_1 = aimed * noise.by_photons(share * each, choose)
             if choose:
-                all_paths = PASSES * paths
-                widths = kernel_widths(tiles, b_1, noise.change, all_paths, price * share).ravel()
+                widths = kernel_widths(tiles, b_1, noise.change, PASSES * paths).ravel()
                 area = (widths / NARROW) ** 2
             else:
                 area = np.ones(len(whole))
             thinner = aimed * found.emitted / (paths * area)
+            gather = _GATHER * found.points
+            gather += _MET * met * float(area.mean()) * paths / found.emitted
             if v_eye > 0:
-                gather = _GATHER * found.points + met * area * paths
                 share = noise.share(thinner, eye_work / (v_eye * gather), each)
             eye_noise = max(v_eye + float((noise.gather / share).mean()), 1e-30)
+            gather *= float(share.mean())
             by_photons = max(0.0, float((b_1 / widths**2).mean()))
-            eye = eye_work + _GATHER * found.points * float(share.mean())
-            eyes, meet = each * tiles.pixels, met * float((share * area).mean())
             if not light_paths:
-                costs = eye / (tiles.pixels * (light + eyes * meet))
-                paths = max(eyes * math.sqrt(by_photons * costs / eye_noise), 1.0)
-            pass_ = eyes * (eye + meet * paths) + paths * light
-            variance = eye_noise / each + by_photons / paths
-            price = variance / PASSES * eyes * met * paths / (NARROW**2 * pass_)
+                costs = (eye_work + gather) / (light * tiles.pixels)
+                paths = max(each * tiles.pixels * math.sqrt(by_photons * costs / eye_noise), 1.0)
 
         # --- What they promise ---
+        pass_ = each * tiles.pixels * (eye_work + gather) + paths * light
         left = pass_ / total
-        error = variance * left
+        error = (eye_noise / each + by_photons / paths) * left
         blur = noise.change * (widths / NARROW) ** 3 if choose else np.zeros(len(whole))
         error += _bias2(float(blur.mean()))
         follow = np.clip(found.over_lobes.sum(1) / np.maximum(found.a.sum(1), 1e-30), 0, 1)
@@ -237,7 +225,7 @@ class Plan:
             error=error,
             work=pass_,
             light_work=paths * light,
-            path_work=work + (eye - eye_work) + meet * paths,
+            path_work=work + gather,
             gathered=found.light.mean(1),
             noise=(noise.gather + noise.alone * thinner) / (filtered * share),
             aim=found.aim,
@@ -298,9 +286,8 @@ class _Noise:
         b_1 += sizes[0] ** 2 * (often * self.narrow[0] + own * self.narrow[1])
         return 0.5 * self.emitted * b_1
 
-    def share(self, thinner, worth, each: int) -> np.ndarray:
-        """q of each pair. thinner: by what photons' variance is multiplied; worth: C over V_r and
-        the work of a gather."""
+    def share(self, thinner, worth: float, each: int) -> np.ndarray:
+        """q of each pair. thinner: by what photons' variance is multiplied; worth: C/(V_r C_g)."""
         share = np.sqrt((self.gather + self.alone * thinner) * worth)
         # Less than one in a pass: then a gather is alone with what it would share.
         more = np.sqrt((self.gather + (self.alone + self.shared) * thinner) * worth)
@@ -314,22 +301,14 @@ def _bias2(change: float) -> float:
     return max(change, 0.0) / (2**1.5 - 1) ** 2
 
 
-def kernel_widths(tiles: Tiles, photons, change, light_paths: float, price=0.0) -> np.ndarray:
-    """Of kernels in each tile, in pixels (see the module's head). photons: B₁ of each pair;
-    light_paths: M N; price: V c/M, of each pair."""
+def kernel_widths(tiles: Tiles, photons, change, light_paths: float) -> np.ndarray:
+    """Of kernels in each tile, in pixels (see the module's head). photons: B₁ of each pair."""
     photons = smooth(tiles.grid(photons))
     photons = np.maximum(photons, 1e-3 * max(float(photons.mean()), 1e-30))
     error = tiles.uncertainty(change)
     bias2 = (2**1.5 - 1) ** -2 * (np.maximum(smooth(tiles.grid(change)), 0) + error)
-    price = smooth(tiles.grid(np.broadcast_to(price, change.size)))
-    fifth, fourth = np.maximum(3 * bias2 / NARROW**3, 1e-30), np.maximum(2 * price, 1e-30)
-    last = 2 * photons / light_paths
-    # From the smaller one of the widths with one term alone, at most 1.2 times too wide.
-    width = np.minimum((last / fifth) ** 0.2, (last / fourth) ** 0.25)
-    for _ in range(_NEWTON):
-        slope = 5 * fifth * width**4 + 4 * fourth * width**3
-        width -= (fifth * width**5 + fourth * width**4 - last) / slope
-    return np.clip(width, _THINNEST, _WIDEST)
+    fifth = 2 * photons * NARROW**3 / (3 * light_paths * np.maximum(bias2, 1e-30))
+    return np.clip(fifth**0.2, _THINNEST, _WIDEST)
 
 
 def within(v, w, weight):

@@ -7,7 +7,7 @@ How variances become decisions is told in ``plan``.
 *Use of the map.* Where it is open (``Prepared.undecided``), the eye paths of the pilot go on as in
 path tracing and tell apart what each use leaves to them (see ``survey_parts``). That of the least
 
-    bias² + V T / (M n P C_0)
+    bias² + (A/n + B/N) (n P (C + q C_g) + N C_p) / (M n P C_0)
 
 is chosen, its error after the work of M passes of path tracing, C_0 for each path. Path tracing
 finds some caustics by rare hits that a pilot may miss, so that their variance seems small; it is
