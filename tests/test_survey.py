@@ -237,6 +237,14 @@ def test_path_tracing_has_found_caustics_by_hits_or_where_there_are_next_to_none
     assert survey._doubt(0 * many, 5e-3 * there, weight) is None
 
 
+def test_few_hits_of_caustics_count_against_path_tracing(variant_llvm_rgb, monkeypatch):
+    promised = []
+    for doubt in (1.0, 100.0, None):
+        monkeypatch.setattr(survey, "_doubt", lambda *_, doubt=doubt: doubt)
+        promised.append(settled(room_with_plate(size=24), map="auto")[0].errors["none"])
+    assert promised[1] > 1.5 * promised[0] > 0 and promised[2] is None
+
+
 @pytest.mark.parametrize("make", [room, room_with_ball])
 def test_gathers_of_a_pilot_are_recorded_once(variant_llvm_rgb, make):
     """Whatever the width of kernels, map and points, whether photons are scored, and whether every

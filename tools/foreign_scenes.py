@@ -74,9 +74,9 @@ def samples_for(scene, plugin, seconds, seed):
         start = time.perf_counter()
         picture(scene, plugin, spp, seed)
         share = (time.perf_counter() - start) / seconds
-        if 0.9 < share < 1.1:
+        tried, spp = spp, max(4, int(spp / np.clip(share, 1 / 16, 16)))
+        if 0.9 < share < 1.1 or spp == tried:
             break
-        spp = max(4, int(spp / np.clip(share, 1 / 16, 16)))
     return spp
 
 
