@@ -90,6 +90,18 @@ def nested_bsdfs(found: dict) -> list:
     return [value for value in found.values() if isinstance(value, mi.BSDF)]
 
 
+# What own_roughness and clearcoat_roughness read.
+ROUGHNESS = (
+    "alpha",
+    "alpha_u",
+    "alpha_v",
+    "roughness",
+    "anisotropic",
+    "clearcoat",
+    "clearcoat_gloss",
+)
+
+
 def own_roughness(bsdf):
     """How to read the roughness of a BSDF by itself: a function of (si, active) that returns
     (alpha_u, alpha_v), or None where it has none that can be read (wrappers have none). Roughness

@@ -7,6 +7,7 @@ import mitsuba as mi
 import pytest
 from aniso_pm import cli
 from aniso_pm.instruments import inspect
+from aniso_pm.map.receivers import has_walked_part, may_gather
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
 
@@ -130,6 +131,15 @@ def test_instances_of_diffuse_things_need_no_more_than_these():
 def test_receivers_are_what_is_rough_or_diffuse(row, general):
     scene = matrix.make(matrix.rows()[row], size=4)
     assert bool(prepare(scene, Settings(), False).needs.general) == general
+
+
+@pytest.mark.parametrize("texture, gathers", [("base_color", False), ("roughness", True)])
+def test_only_textures_of_roughness_make_it_vary(texture, gathers):
+    bsdf = mi.load_dict(
+        {"type": "principled", "roughness": 0.3} | {texture: {"type": "checkerboard"}}
+    )
+    assert may_gather(bsdf, 0.3) == gathers
+    assert has_walked_part(bsdf, 0.3)
 
 
 def test_roughness_that_cannot_be_read_is_named():

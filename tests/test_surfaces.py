@@ -158,3 +158,32 @@ def test_what_lies_on_a_floor_does_not_darken_it(thickness, bsdf):
     found, error = ratio(definition, 0.15)
     print(found, error)
     assert abs(found - 1) < 0.015 + 3 * error
+
+
+def test_kernels_of_rough_texels_reach_over_smooth_ones():
+    """A metal plate of rough and smooth squares, narrower than a kernel: only the rough ones
+    gather, but photons lie on all of them."""
+    T = mi.ScalarTransform4f
+    chequers = {
+        "type": "checkerboard",
+        "color0": 0.05,
+        "color1": 0.5,
+        "to_uv": T().scale([10, 10, 1]),
+    }
+    definition = {
+        "type": "scene",
+        "sensor": looking_down(fov=12),
+        "light": {"type": "point", "position": [0.3, 0, 1.5]},
+        "plate": {
+            "type": "rectangle",
+            "bsdf": {"type": "twosided", "b": {"type": "roughconductor", "alpha": chequers}},
+        },
+        "wall": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90),
+            "bsdf": {"type": "diffuse", "reflectance": 0.9},
+        },
+    }
+    found, error = ratio(definition, 0.15)
+    print(found, error)
+    assert abs(found - 1) < 0.01 + 3 * error

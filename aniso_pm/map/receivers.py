@@ -20,7 +20,7 @@ from collections.abc import Container
 import drjit as dr
 import mitsuba as mi
 
-from ..ndf import children, clearcoat_roughness, nested_bsdfs, own_roughness
+from ..ndf import ROUGHNESS, children, clearcoat_roughness, nested_bsdfs, own_roughness
 
 _WRAPPERS = ("TwoSidedBRDF", "BlendBSDF", "MaskBSDF", "BumpMap", "NormalMap")
 # BSDFs that evaluate exactly the components that BSDFContext.type_mask asks for.
@@ -54,28 +54,33 @@ def may_gather(bsdf, threshold: float) -> bool:
     smallest = _smallest_roughness(bsdf)
     if smallest is None or not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth):
         return False
-    if _varies(bsdf):
+    if _roughness_varies(bsdf):
         return True
     return _uniform(smallest) >= threshold
 
 
 def read_receiver(bsdf, si, threshold: float, general: bool, active):
-    """(is a receiver, is Lambertian, BRDF value in 1/sr of a Lambertian one) at si.
+    """(is a receiver, is Lambertian, BRDF value in 1/sr of a Lambertian one, keeps photons) at si.
 
     bsdf: mi.BSDFPtr; decided once per BSDF while tracing. The value is that of the side that si.wi
     is on, 0 on the back of one-sided surfaces. ``general=False``: only Lambertian receivers exist.
+    Photons are kept on the smooth texels of rough surfaces too, where nothing gathers: kernels of
+    the rough ones reach over them.
     """
 
     def read(instance, si, active):
         if instance is None:  # a scene without shapes
-            return mi.Bool(False), mi.Bool(False), mi.Spectrum(0)
+            return mi.Bool(False), mi.Bool(False), mi.Spectrum(0), mi.Bool(False)
         if is_lambertian(instance):
             up = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), mi.Frame3f.cos_theta(si.wi)))
             value = instance.eval(mi.BSDFContext(), si, up, active)
             # By side, not by value: kernels of lit texels reach over black ones.
-            return _reflects(instance, si), mi.Bool(True), value
+            side = _reflects(instance, si)
+            return side, mi.Bool(True), value, side
         whole, diffuse = _gathered(instance, si, threshold, active) if general else (False, False)
-        return mi.Bool(diffuse) | whole, mi.Bool(False), mi.Spectrum(0)
+        gathers = mi.Bool(diffuse) | whole
+        keeps = mi.Bool(True) if whole is not False and _roughness_varies(instance) else gathers
+        return gathers, mi.Bool(False), mi.Spectrum(0), keeps
 
     return dr.dispatch(bsdf, read, si, active)
 
@@ -110,7 +115,7 @@ def has_walked_part(bsdf, threshold: float) -> bool:
     if mi.has_flag(bsdf.flags(), flags.Delta) or mi.has_flag(bsdf.flags(), flags.Transmission):
         return True
     smallest = _smallest_roughness(bsdf)
-    if smallest is None or (mi.has_flag(bsdf.flags(), flags.Glossy) and _varies(bsdf)):
+    if smallest is None or (mi.has_flag(bsdf.flags(), flags.Glossy) and _roughness_varies(bsdf)):
         return True
     return not _uniform(smallest) >= threshold
 
@@ -201,9 +206,10 @@ def _smallest_roughness(bsdf):
     return smallest
 
 
-def _varies(bsdf) -> bool:
-    """Is any texture of the tree other than uniform?"""
+def _roughness_varies(bsdf) -> bool:
+    """Does a texture of the tree make ``_smallest_roughness`` another from place to place?"""
     found = children(bsdf)
-    return any(
-        isinstance(value, mi.Texture) and value.is_spatially_varying() for value in found.values()
-    ) or any(_varies(nested) for nested in nested_bsdfs(found))
+    textures = [found[name] for name in ROUGHNESS if isinstance(found.get(name), mi.Texture)]
+    return any(texture.is_spatially_varying() for texture in textures) or any(
+        _roughness_varies(nested) for nested in nested_bsdfs(found)
+    )

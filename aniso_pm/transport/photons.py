@@ -214,9 +214,9 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
         same_side = (dr.dot(-ray.d, si.n) * mi.Frame3f.cos_theta(si.wi)) > 0
 
         # --- Leave a photon ---
-        is_receiver, lambertian, _ = read_receiver(bsdf, si, o.roughness, o.general, active)
+        is_receiver, lambertian, _, keeps = read_receiver(bsdf, si, o.roughness, o.general, active)
         power = emitted * β * (wi_s / wi_n)
-        deposit = active & is_receiver & same_side & (depth >= shortest)
+        deposit = active & keeps & same_side & (depth >= shortest)
         if dr.hint(o.caustics == "only", mode="scalar"):
             deposit &= caustic
         finite = dr.all(dr.isfinite(power))

@@ -159,7 +159,7 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
             trail.direct_light(o.use, bsdf, si, wo, f * light, f, o.roughness, scattered, lit)
 
         # --- Leave a gather point ---
-        is_receiver, lambertian, brdf = read_receiver(bsdf, si, o.roughness, o.general, active)
+        is_receiver, lambertian, brdf, _ = read_receiver(bsdf, si, o.roughness, o.general, active)
         is_receiver &= active
         weight = dr.select(lambertian, β * brdf, β)
         here = is_receiver & (depth + o.min_segments <= max_depth)
