@@ -1,10 +1,11 @@
-"""Indirect light agrees with ``path`` whatever shapes and cameras go through
+"""Light agrees with ``path`` whatever shapes, cameras and materials go through
 (tests/random_scenes.py has the method and its false alarms)."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import random_materials
 import random_scenes
 from aniso_pm.rendering import film
 
@@ -33,6 +34,13 @@ def test_indirect_light_of_random_shapes_and_cameras_agrees_with_path():
     kinds = [*random_scenes.SHAPES, *random_scenes.CAMERAS]
     done = assert_nothing_is_found(kinds, 6, 0, 32)
     print(f"{len(done)} tries, {sum(t.again is not None for t in done)} made again")
+
+
+@pytest.mark.slow
+def test_all_light_of_random_materials_agrees_with_path():
+    done = random_materials.run(40, 0, 32)
+    findings = [str(t) for t in done if t.is_finding]
+    assert not findings, "\n".join(findings)
 
 
 @pytest.mark.parametrize("kind", random_scenes.CAMERAS)

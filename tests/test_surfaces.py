@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm.map.photon_word import encode_normal, one_sheet
+from rooms import room
 
 pytestmark = pytest.mark.usefixtures("rgb", "without_pilot")
 
@@ -185,5 +186,22 @@ def test_kernels_of_rough_texels_reach_over_smooth_ones():
         },
     }
     found, error = ratio(definition, 0.15)
+    print(found, error)
+    assert abs(found - 1) < 0.01 + 3 * error
+
+
+@pytest.mark.parametrize("mirror", [-1, 1])
+def test_bump_maps_of_mirrored_cubes_look_where_those_of_path_do(mirror):
+    """They turn their normal to the geometric one, which is on the inside of a mirrored cube: it is
+    black from outside."""
+    T = mi.ScalarTransform4f
+    flat = np.full((2, 2, 1), 0.5, np.float32)
+    bump = {"type": "bumpmap", "arbitrary": {"type": "bitmap", "bitmap": mi.Bitmap(flat)}}
+    cube = {
+        "type": "cube",
+        "to_world": T().translate([0, -0.2, -0.2]).rotate([1, 1, 0], 30).scale([mirror * 0.4] * 3),
+        "bsdf": bump | {"b": {"type": "diffuse", "reflectance": 0.8}},
+    }
+    found, error = ratio(room({"cube": cube}, size=16), 0.05)
     print(found, error)
     assert abs(found - 1) < 0.01 + 3 * error

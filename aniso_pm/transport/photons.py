@@ -207,11 +207,12 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
         active &= si.is_valid()
         bsdf = si.bsdf()
         # Mirrored rectangles and cubes, and meshes wound against their vertex normals, have it on
-        # the other side than the shading normal, which is what BSDFs know.
-        si.n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
-        wi_n, wi_s = dr.abs(dr.dot(ray.d, si.n)), dr.abs(mi.Frame3f.cos_theta(si.wi))
+        # the other side than the shading normal, which is what BSDFs know (but for bump maps, which
+        # turn theirs to si.n: that stays).
+        n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+        wi_n, wi_s = dr.abs(dr.dot(ray.d, n)), dr.abs(mi.Frame3f.cos_theta(si.wi))
         # Where shading and geometric normal disagree about the side nothing is stored (no leaks).
-        same_side = (dr.dot(-ray.d, si.n) * mi.Frame3f.cos_theta(si.wi)) > 0
+        same_side = (dr.dot(-ray.d, n) * mi.Frame3f.cos_theta(si.wi)) > 0
 
         # --- Leave a photon ---
         is_receiver, lambertian, _, keeps = read_receiver(bsdf, si, o.roughness, o.general, active)
@@ -222,7 +223,7 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
         finite = dr.all(dr.isfinite(power))
         reject(deposit & ~finite)
         deposit &= finite & (dr.max(power) > 0)
-        side = dr.mulsign(mi.Normal3f(si.n), dr.dot(-ray.d, si.n))
+        side = dr.mulsign(mi.Normal3f(n), dr.dot(-ray.d, n))
         word = encode_normal(side) | (dr.minimum(depth, SEGMENTS_MAX) << 24)
         if dr.hint(o.caustics == "marked", mode="scalar"):
             word |= dr.select(caustic, mi.UInt32(1 << 31), mi.UInt32(0))
@@ -237,7 +238,7 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
             bs, bent_weight = bent_bounce(ctx, bsdf, si, bs, weight, sampler, bent)
             weight = dr.select(bent, bent_weight, weight)
         wo = si.to_world(bs.wo)
-        wo_n, wo_s = dr.dot(wo, si.n), mi.Frame3f.cos_theta(bs.wo)
+        wo_n, wo_s = dr.dot(wo, n), mi.Frame3f.cos_theta(bs.wo)
         # A reflection through the geometric surface would leak, and its correction has no bound.
         reflected = mi.Frame3f.cos_theta(si.wi) * wo_s > 0
         active &= ~reflected | (same_side & (wo_n * wo_s > 0))
