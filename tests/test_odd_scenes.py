@@ -1,6 +1,7 @@
 """Scenes that lack something, or have what cannot be rendered."""
 
 import aniso_pm  # noqa: F401
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -70,6 +71,35 @@ def test_derivatives_are_refused_with_one_sentence(scene):
         plugin.render_backward(scene, None, None)
     with pytest.raises(Exception, match="derivatives are not supported"):
         plugin.render_forward(scene, None)
+
+
+def test_rendering_while_a_function_is_frozen_is_refused_with_one_sentence(scene):
+    plugin = integrator()
+
+    @dr.freeze
+    def frozen(seed):
+        return plugin.render(scene, seed=seed, spp=1)
+
+    with pytest.raises(RuntimeError) as raised:
+        frozen(mi.UInt32(1))
+    causes = [raised.value.__cause__, getattr(raised.value.__cause__, "__cause__", None)]
+    assert any("take the decorator away" in str(cause) for cause in causes)
+    assert array(plugin.render(scene, spp=1)).mean() > 0
+
+
+def test_lamps_coloured_by_a_mesh_attribute_are_refused_with_one_sentence(rgb, tmp_path):
+    lamp = mi.Mesh("lamp", 3, 1)
+    found = mi.traverse(lamp)
+    found["vertex_positions"], found["faces"] = [-1, -1, 0, 1, -1, 0, 0, 1, 0], [0, 1, 2]
+    found.update()
+    lamp.add_attribute("vertex_color", 3, [1.0] * 9)
+    definition = room(size=4)
+    emitter = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    ply = str(tmp_path / "lamp.ply")
+    lamp.write_ply(ply)
+    definition["lamp"] = {"type": "ply", "filename": ply, "emitter": emitter}
+    with pytest.raises(ValueError, match="has a mesh_attribute for its radiance"):
+        integrator().render(mi.load_dict(definition), spp=1)
 
 
 def test_a_scene_without_shapes_is_rendered(rgb):

@@ -144,6 +144,14 @@ def test_work_is_counted_once_where_gather_points_need_more_room(variant_llvm_rg
     np.testing.assert_array_equal(*works)
 
 
+@pytest.mark.parametrize(
+    "lambertian, times", [(None, 1), ([True] * 4, 1), ([False] * 4, 3), ([True, False] * 2, 2)]
+)
+def test_gathers_that_ask_a_bsdf_are_dearer(variant_llvm_rgb, lambertian, times):
+    points = SimpleNamespace(lambertian=lambertian and mi.Bool(lambertian))
+    assert survey._dearer(points, 3.0) == pytest.approx(times)
+
+
 def test_a_map_thinned_holds_some_of_the_light_paths(variant_llvm_rgb):
     world = mi.load_dict(room_with_ball(size=16))
     scene = prepare(world, Settings(photon_count=4000, map="global"), False)

@@ -66,8 +66,9 @@ _LATER_STRATIFIED = 0.85
 @dataclass(frozen=True)
 class Found:
     """What a use of the map gives to the pairs: light from map a, b through narrow kernels and
-    through wide ones, what came over lobes of a, (pairs, 2); photons that an eye path meets, gather
-    points that it leaves; light paths and photons of a map; how to aim those."""
+    through wide ones, what came over lobes of a, (pairs, 2); photons that an eye path meets and
+    gather points that it leaves, as many as on Lambertian receivers would be the same work; light
+    paths and photons of a map; how to aim those."""
 
     a: np.ndarray
     b: np.ndarray

@@ -310,6 +310,12 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
             f'aniso_pm: variant "{mi.variant()}" is not supported (photons carry no '
             "polarisation); choose llvm_ad_rgb or another unpolarized variant"
         )
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise Unsupported(
+            "aniso_pm: cannot render inside of a function with @dr.freeze, since what a scene "
+            "needs is decided while rendering; take the decorator away (passes are replayed by "
+            "themselves)"
+        )
     repair_bounds(scene)  # before light from outside is aimed at them
     needs = read_scene(scene, settings.gather_roughness)
     source = emission.prepare(scene) if scene.emitters() else None

@@ -56,6 +56,9 @@ from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
 _CAMERA, _VERTEX = 0.3, 0.4
 # The same vertices of paths that go on after they have left gather points.
 _GOING_ON = 1.15
+# Work where receivers are not Lambertian, so many times that where they are: of gathers, each
+# photon of which asks the BSDF, and of eye paths, which tell its parts apart.
+_ASKS_GATHER, _ASKS_PATH = 2.0, 1.5
 # Work of a pass that is not to be exceeded where passes may have any length (see ``Plan.of``): a
 # third of a second.
 _LONGEST = 1.5e6
@@ -209,11 +212,12 @@ def decide(
 
     # --- The global map ---
     first = take(seen.points, dr.compress(~seen.points.caustic))
+    asks = _dearer(seen.points, _ASKS_PATH)
     found = read(maps, first, weigh)
     weight = weigh(found.light)
     v_own = within(own, own, weight)
     plan_of = partial(plan_of, weight=weight)
-    best = plan_of(use="global", v_own=v_own, found=found, work=seen.early)
+    best = plan_of(use="global", v_own=v_own, found=found, work=asks * seen.early)
     errors: dict[str, float | None] = {"global": best.error}
     chosen: tuple[Any, Any] = maps[0], first
 
@@ -225,7 +229,7 @@ def decide(
         maps = [caustics(map_) for map_ in maps]
         any_ = replace(seen.points, caustic=dr.opaque(mi.Bool, False, dr.width(seen.points.lane)))
         found = read(maps, any_, lambda _: weight)
-        work = _GOING_ON * seen.work
+        work = _GOING_ON * asks * seen.work
         plan = plan_of(use="caustic", v_own=v_own, found=found, later=more, work=work)
         errors["caustic"] = plan.error
         if plan.error < _BETTER * best.error:
@@ -327,10 +331,18 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
         found.append([gather(*each) for each in zip(maps, scores, strict=True)])
     (a, over_lobes, met), (b, _, _) = found[0]
     (wide_a, _, _), (wide_b, _, _) = found[1]
-    each = dr.width(points.lane) / lanes
+    dearer = _dearer(points, _ASKS_GATHER)
+    met, each = dearer * met, dearer * dr.width(points.lane) / lanes
     learned = _learned(maps, [column for column, _ in scores])
     emitted, stored = maps[0].emitted, maps[0].stored
     return Found(a, b, wide_a, wide_b, over_lobes, met, each, emitted, stored, learned)
+
+
+def _dearer(points, times: float) -> float:
+    """``times`` where no receiver is Lambertian, 1 where all are."""
+    if points.lambertian is None:
+        return 1.0
+    return 1 + (times - 1) * (1 - float(dr.mean(mi.Float(points.lambertian))[0]))
 
 
 def _scores(map_: PhotonMap, weight):

@@ -38,6 +38,12 @@ def refuse(scene):
                     f'aniso_pm: emitter "{emitter.id()}" is a spot with a "texture", whose light '
                     "cannot be evaluated at given wavelengths; use an RGB variant"
                 )
+        radiance = children(emitter).get("radiance")
+        if isinstance(radiance, mi.Texture) and radiance.class_name() == "MeshAttribute":
+            raise Unsupported(
+                f'aniso_pm: emitter "{emitter.id()}" has a mesh_attribute for its radiance, by '
+                "which Mitsuba cannot draw light paths; use a bitmap"
+            )
         lengths = _scales(emitter)
         if kind in ("Projector", "DirectionalEmitter") and np.abs(lengths - 1).max() > _ROUNDING:
             refuse_scale(emitter)
