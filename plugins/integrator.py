@@ -312,7 +312,8 @@ class AnisoPhotonMapper:
                 prepared, sensor, _as_int(seed), spp, controls, self.statistics
             )
             so_far(done.variance, done.layers, done.passes)
-            if done.map:
+            # Not where the scene holds this integrator: both would live for ever, map and all.
+            if done.map and scene.integrator() is not self:
                 self._last_map = (scene, done.scene, done.map, done.radius)
             image = sensor.film().develop() if develop else mi.TensorXf()
             if evaluate:

@@ -1,5 +1,8 @@
 """Mitsuba's render() contract."""
 
+import gc
+import weakref
+
 import aniso_pm  # noqa: F401
 import drjit as dr
 import mitsuba as mi
@@ -292,3 +295,15 @@ def test_automatic_radius_scales_with_the_scene_and_the_photons(rgb):
             assert 30 < s["photons_gathered"] / s["gather_points"] < 16 * 60
     assert radii[100, 50_000] == pytest.approx(100 * radii[1, 50_000], rel=0.1)
     assert radii[1, 100_000] == pytest.approx(radii[1, 50_000] / 2**0.5, rel=0.1)
+
+
+def test_a_scene_that_holds_its_integrator_is_freed_with_it(rgb):
+    """A map that the integrator kept would keep the scene, which keeps the integrator."""
+    scene = mi.load_dict(
+        room_with_plate(16) | {"integrator": {"type": "aniso_pm", "map": "global"}}
+    )
+    mi.render(scene, spp=1)
+    integrator = weakref.ref(scene.integrator())
+    del scene
+    gc.collect()
+    assert integrator() is None

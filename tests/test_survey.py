@@ -1,5 +1,6 @@
 """What the survey finds, against what renderings of known noise show."""
 
+import gc
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
@@ -257,6 +258,7 @@ def test_few_hits_of_caustics_count_against_path_tracing(variant_llvm_rgb, monke
 def test_gathers_of_a_pilot_are_recorded_once(variant_llvm_rgb, make):
     """Whatever the width of kernels, map and points, whether photons are scored, and whether every
     eye path ends at a gather point, as in a room with nothing but diffuse walls."""
+    gc.collect()  # scenes of other tests: Dr.Jit tells sizes of their arrays apart as well
     scene = mi.load_dict(make(size=24))
     prepared = prepare(scene, Settings(map="global"), False).frozen()
     pilot.settle(prepared, scene.sensors()[0], 0, 16)
