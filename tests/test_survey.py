@@ -146,10 +146,11 @@ def test_work_is_counted_once_where_gather_points_need_more_room(variant_llvm_rg
 
 
 @pytest.mark.parametrize(
-    "lambertian, times", [(None, 1), ([True] * 4, 1), ([False] * 4, 3), ([True, False] * 2, 2)]
+    "lambertian, times",
+    [(None, 1), ([], 1), ([True] * 4, 1), ([False] * 4, 3), ([True, False] * 2, 2)],
 )
 def test_gathers_that_ask_a_bsdf_are_dearer(variant_llvm_rgb, lambertian, times):
-    points = SimpleNamespace(lambertian=lambertian and mi.Bool(lambertian))
+    points = SimpleNamespace(lambertian=None if lambertian is None else mi.Bool(lambertian))
     assert survey._dearer(points, 3.0) == pytest.approx(times)
 
 

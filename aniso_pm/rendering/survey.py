@@ -340,7 +340,7 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
 
 def _dearer(points, times: float) -> float:
     """``times`` where no receiver is Lambertian, 1 where all are."""
-    if points.lambertian is None:
+    if points.lambertian is None or not dr.width(points.lambertian):
         return 1.0
     return 1 + (times - 1) * (1 - float(dr.mean(mi.Float(points.lambertian))[0]))
 
