@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from energy import regions
 from random_light import T
-from random_scenes import SEEDS, Try, shape, suspicious
+from random_scenes import SEEDS, Try, ratios, shape, suspicious
 from rooms import room
 
 BLUR = 0.003
@@ -159,15 +159,8 @@ def compare(made, integrator, spp, first):
         return [np.array(mi.render(made, integrator=plugin, spp=spp, seed=s)) for s in seeds]
 
     ours, theirs = pictures(integrator, spp), pictures({"type": "path"}, 8 * spp)
-    found = {}
-    for name, mask in regions(made).items():
-        means = [np.array([image[mask].mean() for image in side]) for side in (ours, theirs)]
-        if name not in ("image", "shape", "floor") or means[1].mean() < 1e-3:
-            continue
-        relative = [x.std(ddof=1) / SEEDS**0.5 / means[1].mean() for x in means]
-        error = float(np.hypot(np.hypot(*relative), BLUR))
-        found[name] = (float(means[0].mean() / means[1].mean()), error)
-    return found
+    masks = {k: m for k, m in regions(made).items() if k in ("image", "shape", "floor")}
+    return ratios(ours, theirs, masks, BLUR, 1e-3)
 
 
 def attempt(seed, spp):

@@ -149,13 +149,19 @@ def compare(made, spp, first):
         masks = {k: m for k, m in regions(made).items() if k in ("image", "shape")}
     else:
         masks = {"image": ...}
+    return ratios(ours, theirs, masks, BLUR, 1e-4)
+
+
+def ratios(ours, theirs, masks, blur, black):
+    """Region → (mean of our pictures over that of theirs, its error with the blur of kernels) where
+    theirs is not black: the side of a one-sided surface, for example."""
     found = {}
     for name, mask in masks.items():
         means = [np.array([image[mask].mean() for image in side]) for side in (ours, theirs)]
-        if means[1].mean() < 1e-4:  # the side of a one-sided surface that is black
+        if means[1].mean() < black:
             continue
         relative = [x.std(ddof=1) / SEEDS**0.5 / means[1].mean() for x in means]
-        error = float(np.hypot(np.hypot(*relative), BLUR))
+        error = float(np.hypot(np.hypot(*relative), blur))
         found[name] = (float(means[0].mean() / means[1].mean()), error)
     return found
 
