@@ -122,6 +122,18 @@ def test_a_radius_that_nobody_can_mean_is_refused_with_the_range(radius):
         told(room(size=4), initial_radius=radius)
 
 
+@pytest.mark.parametrize("away, size, words", [(3000, 1, "0.27 off"), (0, 1e-3, "size of 1 to")])
+def test_scenes_of_which_mitsuba_starts_rays_far_off_surfaces_are_told(away, size, words):
+    here = mi.ScalarTransform4f().translate([away, 0, 0])
+    lit = {
+        "ball": {"type": "sphere", "to_world": here @ mi.ScalarTransform4f().scale(size)},
+        "light": {"type": "constant"},
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+    }
+    text = told({"type": "scene"} | lit)
+    assert words in text and "Move the scene to the origin" in text, text
+
+
 @pytest.mark.parametrize("sampler", ["stratified", "multijitter", "orthogonal", "ldsampler"])
 def test_samplers_that_round_the_samples_up_are_counted_as_they_are(sampler):
     definition = room(size=4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from .pilot import LARGEST
@@ -15,6 +16,8 @@ _SPECTRAL_PASSES = 16
 _NAMED = 3
 # Photons in the mean kernel below which a radius that was given cannot be meant.
 _FEWEST_IN_KERNEL = 0.1
+# Share of a scene's extent by which rays may begin off surfaces; energy is wrong by as much.
+_LARGEST_OFFSET = 0.005
 
 
 def before(scene: Prepared) -> None:
@@ -32,6 +35,7 @@ def before(scene: Prepared) -> None:
             "its grooves run along the first edge of every triangle. Give it texture "
             "coordinates (u along the grooves' alpha_u)",
         )
+    _ray_offset(scene)
     _large_radius(scene)
     passes = scene.settings.passes
     if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
@@ -72,6 +76,23 @@ def after(scene: Prepared, statistics: dict[str, Any]) -> None:
             _warn_of_radius(
                 scene, f"kernels hold {mean:.2g} photons in the mean, the rest is noise"
             )
+
+
+def _ray_offset(scene):
+    """Mitsuba starts rays (1 + max |p|) ε off the surface at p: world units, not the scene's."""
+    if not scene.scene.shapes():
+        return
+    box = scene.scene.bbox()
+    farthest = float(dr.max(dr.maximum(dr.abs(box.min), dr.abs(box.max))))
+    offset = (1 + farthest) * mi.math.RayEpsilon
+    if offset > _LARGEST_OFFSET * scene.extent:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"aniso_pm: the scene is {scene.extent:.3g} large and up to {farthest:.3g} from the "
+            f"origin, where Mitsuba starts rays {offset:.2g} off surfaces: light passes through "
+            'edges and contacts, with "path" as well. Move the scene to the origin, or scale it '
+            "to a size of 1 to 1000",
+        )
 
 
 def _large_radius(scene):
