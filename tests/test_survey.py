@@ -214,6 +214,19 @@ def test_passes_of_open_end_are_short(monkeypatch, light, eye, each):
 
 
 @pytest.mark.parametrize(
+    ("light", "eye", "each"), [(1e7, 1e4, 27), (1e7, 1e6, 14), (1e5, 2e5, 7), (1e5, 3e6, 1)]
+)
+def test_light_paths_that_somebody_wants_take_no_samples_away(monkeypatch, light, eye, each):
+    """light: work of a pass's light paths, however many samples; eye: of each sample a pixel."""
+
+    def of(each, **_):
+        return SimpleNamespace(each=each, light_work=light, work=light + eye * each)
+
+    monkeypatch.setattr(plan.Plan, "_of", staticmethod(of))
+    assert plan.Plan.of(1.5e6, 27, light_paths=100_000).each == each
+
+
+@pytest.mark.parametrize(
     ("light", "eye", "given", "paths"),
     [
         (1e6, 1e4, 0, 1e6),

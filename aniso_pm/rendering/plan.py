@@ -110,10 +110,13 @@ class Plan:
 
     @staticmethod
     def of(longest: float, each: int, **given) -> Plan:
-        """Of passes whose work is ``longest`` at most. Where they would have less than FEW samples
-        a pixel, up to four times as long, if their light paths alone are no more work than that;
-        with one sample as long as its eye paths ask for. given: as of ``_of``."""
+        """Of passes whose work is ``longest`` at most, or, where light paths are given, twice that
+        of those. Where they would have less than FEW samples a pixel, up to four times as long, if
+        their light paths alone are no more work than that; with one sample as long as its eye paths
+        ask for. given: as of ``_of``."""
         plan = Plan._of(each, **given)
+        if given["light_paths"]:
+            longest = max(longest, 2 * plan.light_work)
         if plan.work > longest and plan.each > FEW:
             plan = Plan._of(max(FEW, int(plan.each * longest / plan.work)), **given)
         too_long = max(plan.work / 4, plan.light_work) / longest
