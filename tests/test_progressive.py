@@ -2,6 +2,7 @@
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import aniso_pm  # noqa: F401
@@ -109,7 +110,8 @@ def test_automatic_photon_count_is_kept_when_resuming(tmp_path):
     scene = load(48)
     render(scene, integrator(photon_count=0, passes=2), 8, checkpoint=Checkpoint(path))
     state = State.load(path)
-    chosen = state.identity["photon count"]
+    chosen = state.settled.count
+    state.settled = replace(state.settled, count=chosen + 1)
     state.identity["photon count"] = chosen + 1
     state.save(path)
     plugin = integrator(photon_count=0, passes=3)

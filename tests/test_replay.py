@@ -8,7 +8,7 @@ import matrix
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.rendering import one_pass, replay
+from aniso_pm.rendering import beginning, one_pass, replay
 from conftest import slow
 from passes import close, integrator, load, render
 
@@ -68,6 +68,21 @@ def test_what_cannot_be_replayed_is_traced_pass_by_pass(monkeypatch):
     monkeypatch.setattr(one_pass.films, "splat", fail)
     with pytest.raises(RuntimeError, match="cannot be recorded"):
         render(scene, integrator(passes=3), 6)
+
+
+def test_errors_of_those_who_watch_are_their_own(monkeypatch):
+    """They say nothing about what Dr.Jit can record."""
+    monkeypatch.setattr(beginning, "WAVEFRONT", 64)
+    plugin, told = integrator(passes=2), []
+
+    def progress(done, total, text):
+        told.append(done)
+        raise RuntimeError("not recorded")
+
+    plugin.progress = progress
+    with pytest.raises(RuntimeError, match="not recorded"):
+        render(load(), plugin, 4)
+    assert told == [0.5]
 
 
 @pytest.fixture

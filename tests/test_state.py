@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import aniso_pm  # noqa: F401
@@ -9,8 +10,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from aniso_pm.rendering import beginning, survey
 from aniso_pm.rendering.digest import differences, scene_entries
+from aniso_pm.rendering.settled import Settled
 from aniso_pm.rendering.state import Checkpoint, State, StateError, describe, merge
+from aniso_pm.transport import aim
+from aniso_pm.transport.focus import Focus
 from conftest import leave_out_the_pilot
 from passes import close, integrator, load, render
 from rooms import room, room_with_plate
@@ -77,16 +82,55 @@ def test_resuming_renders_the_missing_passes_only(states):
 def test_resuming_keeps_the_bandwidth_and_the_kernels_that_the_pilot_chose(tmp_path):
     path = tmp_path / "a.state"
     scene = load()
-    render(scene, integrator(passes=2, initial_radius=0.0), 4, checkpoint=Checkpoint(path))
+    free = {"initial_radius": 0.0, "photon_count": 0, "kernel": "auto"}
+    render(scene, integrator(passes=2, **free), 4, checkpoint=Checkpoint(path))
     state = State.load(path)
-    chosen = state.identity["initial radius"]
-    assert state.identity["lobes followed"] and state.statistics["kernel"] == "anisotropic"
-    state.identity |= {"initial radius": 0.5 * chosen, "lobes followed": False}
+    chosen, followed = state.settled, state.identity["lobes followed"]
+    assert followed == (state.statistics["kernel"] == "anisotropic")
+    state.settled = replace(chosen, radius=0.5 * chosen.radius, lobes=0.0 if followed else 1.0)
+    state.identity |= {"initial radius": 0.5 * chosen.radius, "lobes followed": not followed}
     state.save(path)
-    plugin = integrator(passes=3, initial_radius=0.0)
+    plugin = integrator(passes=3, **free)
     render(scene, plugin, 6, checkpoint=Checkpoint(path, resume=True))
-    assert plugin.statistics["initial_radius"] == 0.5 * chosen
-    assert plugin.statistics["kernel"] == "isotropic"
+    assert plugin.statistics["initial_radius"] == 0.5 * chosen.radius
+    assert plugin.statistics["kernel"] == ("isotropic" if followed else "anisotropic")
+
+
+@pytest.mark.with_pilot
+def test_resumed_renderings_of_open_end_have_no_other_pilot(tmp_path, monkeypatch):
+    path, scene = tmp_path / "a.state", load()
+    monkeypatch.setattr(survey, "_LONGEST", 2e5)  # a pass of fewer samples than are asked for
+    parameters = {"initial_radius": 0.0, "photon_count": 0, "time": 1e-3}
+    render(scene, integrator(**parameters), 64, checkpoint=Checkpoint(path))
+    before = State.load(path)
+    assert before.count == 1 and before.settled.each < 64 and before.settled.share.size > 1
+    monkeypatch.setattr(beginning, "settle", lambda *_: pytest.fail("a pilot"))
+    resumed = integrator(**parameters | {"time": 0.0, "passes": 2})
+    render(scene, resumed, 2 * 64, checkpoint=Checkpoint(path, resume=True))
+    after = State.load(path)
+    assert after.count == 2
+    np.testing.assert_equal(after.settled.packed(), before.settled.packed())
+
+
+def test_what_was_chosen_survives_the_disk(tmp_path):
+    boxes = np.random.default_rng(1).random((3, 4, 5))
+    aimed = aim.Learned(boxes[0], boxes[1], boxes[2][:, 0], 0.5, 0.7, 0.9)
+    pixels = np.arange(12)
+    numbers = pixels.astype(np.float32)
+    few = np.ones(1, np.float32)
+    path, scene = tmp_path / "a.state", load()
+    render(scene, integrator(passes=1), 2, checkpoint=Checkpoint(path))
+    state = State.load(path)
+    errors, focus = {"none": None, "global": 1 / 3}, Focus((1.0, 2.0, 1 / 3), 0.7)
+    per_pixel = numbers, pixels.astype(np.uint32), numbers / 7
+    for kept in (
+        Settled("caustic", errors, 7, 1 / 7, 3, few, None, few, None, 0.25),
+        Settled("none", {}, 0, 0.1, 1, *per_pixel, aimed, 0.0, focus),
+    ):
+        replace(state, settled=kept).save(path)
+        loaded = State.load(path).settled
+        np.testing.assert_equal(loaded.packed(), kept.packed())
+        assert type(loaded.aim) is type(kept.aim) and loaded.focus == kept.focus
 
 
 def test_resuming_a_time_budget_counts_what_was_spent(tmp_path):

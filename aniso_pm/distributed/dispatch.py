@@ -106,7 +106,7 @@ class Elsewhere:
                 "seed": run.seed,
                 "spp": run.spp,
                 "first_pass": run.controls.first_pass,
-                "settled": worker.shrunk(run.decided.settled),
+                "settled": run.decided.settled,
                 "variance": run.decided.variance,
             },
         )

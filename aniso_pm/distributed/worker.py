@@ -145,7 +145,7 @@ class _Rendering:
         if limit and on_cpu and not settings.max_memory:  # a GPU has memory of its own
             settings = settings.with_(max_memory=limit)
         prepared = prepare(world, settings, job.render["hide_emitters"])
-        settled = grown(job.render["settled"])
+        settled = job.render["settled"]
         controls = Controls(job.render["first_pass"], settled=settled)
         seed, spp = job.render["seed"], job.render["spp"]
         self.run = progressive.Run(prepared, sensor, seed, spp, controls, {})
@@ -241,20 +241,3 @@ class _Worker:
             yield
         finally:
             mi.set_log_level(before)
-
-
-def shrunk(settled):
-    """What a pilot has chosen (``pilot.Settled``), in as few bytes as it takes."""
-    counts = settled.counts
-    return replace(
-        settled,
-        share=settled.share.astype(np.float32),
-        widths=settled.widths.astype(np.float32),
-        counts=None if counts is None else counts.astype(np.uint32),
-    )
-
-
-def grown(settled):
-    """Inverse of :func:`shrunk`."""
-    counts = settled.counts
-    return replace(settled, counts=None if counts is None else counts.astype(np.int64))

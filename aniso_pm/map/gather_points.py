@@ -21,10 +21,10 @@ class GatherPoints:
     path       GlossyVertex, or None where the scene has no anisotropic lobes.
     origin, d  ray that found p, or None where all receivers are Lambertian.
     lambertian is the receiver Lambertian? None where all are.
-    caustic    only caustic photons are to be read; None where all points agree. (survey: they are
-               the map's only if it holds caustics alone.)
+    caustic    only caustic photons are to be read; None where all points agree.
     distance   length of the path from the camera, world units; None where nobody asks.
-    later      has the path left a gathered part before? None where nobody asks, or none has.
+    later      has the path left a gathered part before? (survey: then points are the caustic map's
+               only.) None where nobody asks, or none has.
     wall       walls.Wall beside the point; None where nobody looks.
     """
 

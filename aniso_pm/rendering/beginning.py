@@ -16,9 +16,10 @@ from . import film as films
 from .allotment import Allotment
 from .controls import Controls
 from .layered import Layered
-from .pilot import Settled, photons_per_path, settle
+from .pilot import photons_per_path, settle
 from .prepared import Prepared
 from .schedule import Shares, shares
+from .settled import Settled
 
 # Eye samples traced at once, where there is memory for them (see ``memory``).
 WAVEFRONT = 1 << 21
@@ -31,7 +32,7 @@ class Decided:
     scene      with all that was chosen for it.
     settled    what that was.
     shares     samples of each pass; allotment: of each pixel.
-    gathering  share of the eye paths of each pixel that gather (mi.Float); None: all do.
+    gathers    share of the eye paths of each pixel that gather (mi.Float); None: all do.
     layered    layers that are summed, or None.
     plan       wavefronts that fit into the memory.
     variance   is the spread of passes kept?
@@ -42,7 +43,7 @@ class Decided:
     settled: Settled
     shares: Shares
     allotment: Allotment
-    gathering: Any
+    gathers: Any
     layered: Layered | None
     plan: memory.Plan
     variance: bool
@@ -70,7 +71,7 @@ class Decided:
         return {
             "initial_radius": settled.radius,
             "radius_automatic": given.initial_radius == 0,
-            "share_of_gathers": float(settled.share.mean()),
+            "share_of_gathers": float(settled.share.mean(dtype=float)),
             "photon_count": settled.count,
             "photon_count_automatic": given.photon_count == 0,
             "aim": settled.aim and settled.aim.gains(),
@@ -87,12 +88,12 @@ class Decided:
 
 
 def decide(
-    scene: Prepared, sensor, seed: int, spp: int, controls: Controls, known: dict[str, Any]
+    scene: Prepared, sensor, seed: int, spp: int, controls: Controls, known: Settled | None
 ) -> Decided:
     """Run the pilot, and make ready for passes.
 
     spp    as in ``progressive.render``.
-    known  identity of the earlier run that is gone on from; empty: there is none.
+    known  what was chosen elsewhere, or by an earlier run that is gone on from: there is no pilot.
 
     Raises ValueError where samples, layers or memory do not fit; for what reason it says.
     """
@@ -104,19 +105,14 @@ def decide(
     films.begin(film, bool(controls.callback or controls.checkpoint))
 
     # --- What is chosen ---
-    # The same pilot as before, whatever is known: what it chose pixel by pixel is not kept.
-    exactly = known.get(digest.SAMPLES)
-    each = exactly or share.each
-    scene, settled = _settle(scene, sensor, seed, each, bool(exactly), controls.settled)
+    scene, settled = _settle(scene, sensor, seed, share.each, known)
     settled = replace(
         settled,
-        use=known.get(digest.USE) or settled.use,
-        count=settings.photon_count or known.get(digest.COUNT) or settled.count,
-        radius=settings.initial_radius or known.get(digest.RADIUS) or settled.radius,
+        count=settings.photon_count or settled.count,
+        radius=settings.initial_radius or settled.radius,
     )
     share = replace(share, each=settled.each)
     scene = settled.applied(scene)
-    scene = replace(scene, lobes_matter=known.get(digest.LOBES, scene.follow_lobes))
 
     # --- What follows ---
     # Variances are worth their memory where there can be any, now or after a merge.
@@ -127,29 +123,30 @@ def decide(
     if not settings.initial_radius:
         pixel = footprint.of(sensor, settled.radius, settled.widths)
         scene = replace(scene, footprint=pixel)
-    gathering = None
+    gathers = None
     if settled.share.min() < 1:
-        gathering = own(mi.Float, np.resize(settled.share, pixels).astype(np.float32))
+        gathers = own(mi.Float, np.resize(settled.share, pixels))
     replayed = settings.passes != 1 and scene.replays
-    allotment = Allotment(pixels, settled.each, settled.counts)
-    return Decided(scene, settled, share, allotment, gathering, layered, plan, variance, replayed)
+    counts = None if settled.counts is None else settled.counts.astype(np.int64)
+    allotment = Allotment(pixels, settled.each, counts)
+    return Decided(scene, settled, share, allotment, gathers, layered, plan, variance, replayed)
 
 
 def _settle(
-    scene: Prepared, sensor, seed: int, each: int, exactly: bool, known: Settled | None
+    scene: Prepared, sensor, seed: int, each: int, known: Settled | None
 ) -> tuple[Prepared, Settled]:
-    """(the scene, frozen if it can be, what is chosen). known: by somebody else."""
+    """(the scene, frozen if it can be, what is chosen)."""
     # The response curves of a specfilm do not survive a replay of the scene that they are in.
     if not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
         frozen = scene.frozen()
         try:
-            return frozen, known or settle(frozen, sensor, seed, each, exactly)
+            return frozen, known or settle(frozen, sensor, seed, each)
         except RuntimeError as error:
             # Dr.Jit cannot record every scene (materials written in Python, for example).
             if is_interrupt(error):
                 raise
             mi.Log(mi.LogLevel.Debug, f"aniso_pm: nothing is replayed: {one_line(error)}")
-    return scene, known or settle(scene, sensor, seed, each, exactly)
+    return scene, known or settle(scene, sensor, seed, each)
 
 
 def _job(

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .done import Batch
-from .pilot import Settled
 from .prepared import Prepared
+from .settled import Settled
 from .state import Checkpoint
 
 if TYPE_CHECKING:

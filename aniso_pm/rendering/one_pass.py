@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -20,10 +21,13 @@ from .beginning import Decided
 from .done import Traced
 from .evening import Evening
 from .layered import plus
-from .prepared import EYE, PROBE, THINNING, stream_seed
+from .prepared import EYE, PROBE, THINNING, Prepared, stream_seed
 from .schedule import bandwidth, wavelength_sample
 from .stage_times import Clock
-from .state import COUNTS
+from .state import COUNTS, added
+
+_GATHERED = [name for name in COUNTS if name.startswith(("gather_points", "photons_gathered"))]
+_Result = TypeVar("_Result")
 
 
 class Tracer:
@@ -47,25 +51,16 @@ class Tracer:
     def __call__(self, index: int, report: Callable[[int, float], None]) -> Traced:
         """Pass ``index``. report: called with it and the share of it that is done, after every
         wavefront but the last."""
-        try:
-            return self._trace(index, report)
-        except RuntimeError as error:
-            # As in the pilot, which does not record everything (see ``beginning``).
-            if is_interrupt(error) or not self.replayed:
-                raise
-            mi.Log(mi.LogLevel.Debug, f"aniso_pm: passes are not replayed: {one_line(error)}")
-            self.replayed, self.scene = False, self.scene.thawed()
-            return self._trace(index, report)
-
-    def _trace(self, index: int, report: Callable[[int, float], None]) -> Traced:
         # --- Photons ---
         self.unfinished = None
         decided, settings = self.decided, self.scene.settings
         self.radius = bandwidth(decided.settled.radius, settings.alpha, index)
         colour = wavelength_sample(self.seed, index)
         wavelengths = films.wavelengths(self.sensor, colour) if mi.is_spectral else None
-        self.map = self.scene.photon_map(
-            self.seed, index, self.photons, wavelengths, self.clock.lap
+        self.map = self._replayed(
+            lambda scene: scene.photon_map(
+                self.seed, index, self.photons, wavelengths, self.clock.lap
+            )
         )
         self.photons = max(self.photons, self.map.stored)
         counts = dict.fromkeys(COUNTS, 0)
@@ -84,7 +79,11 @@ class Tracer:
         parts = allotment.wavefronts(index, more, before, decided.wavefront)
         for wavefront, (lanes, done) in enumerate(parts):
             random = mi.sample_tea_32(stream_seed(self.seed, PROBE, index), wavefront)[0]
-            image, found = self._wavefront(index, lanes, radius, random, colour, counts, image)
+            wavefront_of = partial(self._wavefront, index, lanes, radius, random, colour)
+            splats, found, counted = self._replayed(wavefront_of)
+            counts = added(counts, counted)
+            image = splats if image is None else image + splats
+            dr.eval(image)
             layers = plus(layers, found) if layered else None
             self.clock.lap("film")
             counts["spp"] = int(spp * done)
@@ -94,25 +93,36 @@ class Tracer:
         counts["spp"] = spp
         return Traced(image, counts, layers)
 
-    def _wavefront(self, index: int, lanes, radius, random, colour: float, counts, image):
-        """Some eye samples: (image with them, their sums of layers).
+    def _replayed(self, stage: Callable[[Prepared], _Result]) -> _Result:
+        """What a stage of a pass gives on the scene. If that cannot be recorded it begins anew, and
+        nothing is replayed from then on."""
+        try:
+            return stage(self.scene)
+        except RuntimeError as error:
+            # As in the pilot, which does not record everything (see ``beginning``).
+            if is_interrupt(error) or not self.replayed:
+                raise
+            mi.Log(mi.LogLevel.Debug, f"aniso_pm: passes are not replayed: {one_line(error)}")
+            self.replayed, self.scene = False, self.scene.thawed()
+            return stage(self.scene)
+
+    def _wavefront(self, index: int, lanes, radius, random, colour: float, scene: Prepared):
+        """Some eye samples: (image of them, their sums of layers, what they count of COUNTS).
 
         lanes   allotment.Lanes.
         random  seed for density estimation.
         colour  of the pass, see ``film.sample_rays``.
-        counts  are raised.
-        image   of the wavefronts before, or None.
         """
-        decided, sensor, scene = self.decided, self.sensor, self.scene
+        decided, sensor = self.decided, self.sensor
         sampler = mi.load_dict({"type": "owen_sobol"})
         sampler.begin(stream_seed(self.seed, EYE), lanes.pixel, lanes.sample)
         ray, ray_weight, position = films.sample_rays(sensor, sampler, lanes.pixel, colour)
         dr.eval(ray, ray_weight, position)
         even = None
-        if decided.gathering is not None:
+        if decided.gathers is not None:
             choice = stream_seed(self.seed, THINNING, index)
             places = lanes.pixel, lanes.place, lanes.of
-            thinning = Thinning.of_pass(decided.gathering, choice, *places)
+            thinning = Thinning.of_pass(decided.gathers, choice, *places)
             even = Evening(thinning, lanes, films.sampled_size(sensor.film())[0])
 
         # --- Eye paths and density estimation ---
@@ -130,34 +140,33 @@ class Tracer:
             even=even,
             for_layers=True,
         )
-        self._points = max(self._points, _count(seen.gathered, counts))
+        counts = _counts(seen.gathered)
+        self._points = max(self._points, counts["gather_points"])
 
         # --- Into the image ---
         finite = dr.all(dr.isfinite(seen.L))
-        counts["eye_samples"] += lanes.count
-        counts["eye_samples_rejected"] += dr.width(seen.L) - int(dr.count(finite)[0])
+        counts["eye_samples"] = lanes.count
+        counts["eye_samples_rejected"] = dr.width(seen.L) - int(dr.count(finite)[0])
         L = dr.select(finite, seen.L, 0) * ray_weight
-        splats = films.splat(sensor.film(), lanes, position, L, seen.valid, ray.wavelengths)
-        image = splats if image is None else image + splats
+        image = films.splat(sensor.film(), lanes, position, L, seen.valid, ray.wavelengths)
         dr.eval(image)
         layers: dict[str, Any] = {}
         if decided.layered is not None:
             layers = decided.layered.wavefront(
                 position, L, seen.seen, seen.gathered, ray, ray_weight, lanes, finite
             )
-        return image, layers
+        return image, layers, counts
 
 
-def _count(gathered, counts) -> int:
-    """Raises the counts by what was gathered; gather points of it."""
-    points = 0
+def _counts(gathered) -> dict[str, int]:
+    """What was gathered."""
+    counts = dict.fromkeys(_GATHERED, 0)
     for found in gathered:
-        points += dr.width(found.lane)
+        counts["gather_points"] += dr.width(found.lane)
         counts["gather_points_anisotropic"] += int(dr.count(found.follows)[0])
         counts["gather_points_clamped"] += int(dr.count(found.clamped)[0])
         counts["gather_points_capped"] += int(dr.count(found.capped)[0])
         counts["gather_points_degenerate"] += int(dr.count(found.degenerate)[0])
         counts["gather_points_off_surface"] += int(dr.count(found.lost)[0])
         counts["photons_gathered"] += int(dr.sum(mi.Float64(found.photons))[0])
-    counts["gather_points"] += points
-    return points
+    return counts

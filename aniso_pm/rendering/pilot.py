@@ -9,7 +9,7 @@ by the light that it receives: a caustic on a dark floor sets the bandwidth, not
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -18,12 +18,11 @@ import numpy as np
 from ..map import density
 from ..map.gather_points import take
 from ..map.photon_map import EMPTY
-from ..transport import aim
 from ..transport.focus import Focus, find
-from ..transport.uses import Use
 from . import footprint, survey
 from .film import one_each, sample_ray, wavelengths
 from .prepared import PILOT, PILOT_CAMERA, PILOT_EYE, Prepared, stream_seed
+from .settled import Settled
 
 # Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
 PHOTONS_PER_KERNEL = 60
@@ -47,50 +46,10 @@ def camera_rays(sensor, seed: int):
     return one_each(ray, _RAYS)
 
 
-@dataclass(frozen=True)
-class Settled:
-    """What a rendering needs to know before its first pass, given or chosen.
-
-    use     of the map (see ``uses``).
-    errors  relative MSE that each use promises, where there was a choice (see ``survey``).
-    count   light paths per pass.
-    radius  bandwidth of the first pass, world units.
-    each    eye samples of a pixel in a pass (see ``survey``).
-    share   of the eye paths of each pixel that gather (see ``thinning``).
-    counts  samples of each pixel in a pass (see ``allotment``), or None: all alike.
-    widths  of the kernels of each pixel, in pixels (see ``footprint``).
-    aim     of light paths (aim.Learned), or None: they begin evenly.
-    lobes   part of the error that kernels make which follow lobes (see ``plan``).
-    focus   where light from outside begins, or None: anywhere.
-    """
-
-    use: Use
-    errors: dict[str, float | None]
-    count: int
-    radius: float
-    each: int
-    share: np.ndarray
-    counts: np.ndarray | None
-    widths: np.ndarray
-    aim: aim.Learned | None
-    lobes: float
-    focus: Focus | None = None
-
-    def applied(self, scene: Prepared) -> Prepared:
-        """The scene with the use of its map, with or without lobes, and with the number and aim of
-        light paths."""
-        matter = scene.worth_following(self.lobes)
-        aimed = self.aim.aim() if self.aim else None
-        scene = scene.focused(self.focus)
-        scene = replace(scene, chosen=self.use, aim=aimed, lobes_matter=matter)
-        return scene.with_(photon_count=self.count)
-
-
-def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False) -> Settled:
+def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
     """What the parameters do not give is chosen, by a function of scene, parameters and seed.
 
-    each     eye samples of a pixel in a pass.
-    exactly  so many; else, where passes go on without end, there may be fewer.
+    each  eye samples of a pixel in a pass; where passes go on without end, there may be fewer.
     """
     colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
     count, radius = scene.settings.photon_count, scene.settings.initial_radius
@@ -111,7 +70,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
         # Nothing says how wide pixels are: one radius for all.
         usual = scene.with_(photon_count=count or USUAL)
         tried = automatic_radius(usual, camera_rays(sensor, seed), seed, maps[0])
-    found = survey.decide(scene, sensor, tried or None, seed, each, exactly, seen, maps, count)
+    found = survey.decide(scene, sensor, tried or None, seed, each, seen, maps, count)
     count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
     # Aimed photons are closer together where they show.
     worth = count / found.aim.variance if found.aim else count
@@ -122,9 +81,9 @@ def settle(scene: Prepared, sensor, seed: int, each: int, exactly: bool = False)
         count=count,
         radius=radius,
         each=found.each,
-        share=found.share,
-        counts=found.counts,
-        widths=found.widths,
+        share=found.share.astype(np.float32),
+        counts=None if found.counts is None else found.counts.astype(np.uint32),
+        widths=found.widths.astype(np.float32),
         aim=found.aim,
         lobes=found.lobes,
         focus=focus if found.use != "none" else None,

@@ -1,9 +1,10 @@
 """Passes: fresh photons and fresh eye paths at a shrinking bandwidth, until a rule says stop.
 
-Probabilistic progressive photon mapping [Knaus and Zwicker 2011]: pass i + 1 uses a kernel whose
-area is (i + α)/(i + 1) times that of pass i. Variance grows and bias shrinks so that the mean over
-passes converges to the right image. Passes are pure: pass i depends on (scene, parameters, seed, i)
-alone, so that they can be rendered in several runs, or on several machines, and added up.
+Probabilistic progressive photon mapping [Knaus and Zwicker 2011]: the kernel of pass i, counted
+from 0, has (i + α)/(i + 1) times the area of that of the pass before. Variance grows and bias
+shrinks so that the mean over passes converges to the right image. Passes are pure: pass i depends
+on (scene, parameters, seed, i) alone, so that they can be rendered in several runs, or on several
+machines, and added up.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ class Run:
             self.seed,
             self.spp,
             self.controls,
-            earlier.identity if earlier else {},
+            earlier.settled if earlier else self.controls.settled,
         )
         self.clock.lap("pilot")
         self.stopping.count_compilation()
@@ -141,7 +142,10 @@ class Run:
         for index in range(first, first + count) if count else itertools.count(first):
             if index in done:
                 continue
-            if self.stopping.reached(len(done), self.statistics["relative_error"]):
+            # Estimates between those that are due are for people: no rendering ends by them.
+            due = self.stopping.error_is_due(len(done))
+            error = self.statistics["relative_error"] if due else None
+            if self.stopping.reached(len(done), error):
                 return
             yield index
             done.add(index)
@@ -260,6 +264,7 @@ class Run:
             self.stopping.spent(),
             self.statistics,
             self.done.arrays(),
+            self.decided.settled,
         )
 
     # --- At the end ---
@@ -290,7 +295,8 @@ class Run:
 
     def rendered(self) -> Rendered:
         """What is left."""
-        chosen = replace(self.decided.scene, footprint=None)
+        scene = self.tracer.scene if self.tracer else self.decided.scene
+        chosen = replace(scene, footprint=None)
         return Rendered(
             chosen, self.tracer.map, self.radius, self.variance, self.done.layers, self.passes
         )

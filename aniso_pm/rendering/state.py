@@ -1,10 +1,11 @@
 """The state of an unfinished rendering on disk: passes done, their sums, what they depend on.
 
 Format: a NumPy archive (.npz) of the arrays first, square, cross (see ``accumulate``), layers where
-there are any (see ``layered``), and "header", JSON text with the format's version, the identity
-(see ``digest``), the passes as half-open ranges, statistics, the seconds spent, and a SHA-256 of
-all the rest. Files appear whole or not at all and are never trusted: what is truncated, altered or
-of another version is refused.
+there are any (see ``layered``), those of what a pilot has chosen (see ``settled``) with "chosen, "
+before their names, and "header", JSON text with the format's version, the identity (see
+``digest``), the passes as half-open ranges, statistics, the seconds spent, the rest of what was
+chosen, and a SHA-256 of all that. Files appear whole or not at all and are never trusted: what is
+truncated, altered or of another version is refused.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import json
 import time
 import zipfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,14 +24,15 @@ import numpy as np
 
 from ..pictures import output
 from ..transport.layers import parse
-from .accumulate import NAMES as _ARRAYS
 from .accumulate import mean_and_variance
 from .digest import differences
 from .layered import develop
+from .settled import Settled
 
-VERSION = 1
+VERSION = 2
 _N = TypeVar("_N", int, float)
 _OPTIONAL = ("layers", "denoising")
+_CHOSEN = "chosen, "
 # What a pass counts.
 COUNTS = (
     "photons_emitted",
@@ -49,6 +51,10 @@ COUNTS = (
 )
 
 
+# Fields of a State that its header holds as they are.
+_IN_HEADER = ("identity", "film", "passes", "seconds", "statistics")
+
+
 class StateError(ValueError):
     """A state cannot be used: it is damaged, or belongs to another rendering."""
 
@@ -63,6 +69,7 @@ class State:
     seconds     rendering time spent on them.
     statistics  of the renderer, over these passes.
     arrays      ``Sums.arrays()``, and the sums of layers that were asked for (``layered``).
+    settled     what a pilot has chosen, or parameters have given.
     """
 
     identity: dict[str, Any]
@@ -71,6 +78,7 @@ class State:
     seconds: float
     statistics: dict[str, Any]
     arrays: dict[str, np.ndarray] = field(repr=False)
+    settled: Settled = field(repr=False)
 
     @property
     def count(self) -> int:
@@ -95,12 +103,13 @@ class State:
 
     def save(self, path: Path) -> None:
         """Write atomically, down to the disk. Raises ``output.OutputError``."""
-        header = asdict(self)
-        del header["arrays"]
+        chosen, fields_ = self.settled.packed()
+        arrays = self.arrays | {_CHOSEN + name: array for name, array in fields_.items()}
+        header = {name: getattr(self, name) for name in _IN_HEADER} | {"chosen": chosen}
         header = output.plain(header) | {"format": "aniso_pm state", "version": VERSION}
-        header["sha256"] = _checksum(header, self.arrays)
+        header["sha256"] = _checksum(header, arrays)
         entries: dict[str, Any] = {"header": np.array(json.dumps(header, ensure_ascii=False))}
-        entries |= self.arrays
+        entries |= arrays
         with output.replacing(path) as partial, open(partial, "wb") as file:
             np.savez(file, **entries)
 
@@ -111,8 +120,7 @@ class State:
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
                 header = json.loads(str(archive["header"]))
-                there = [name for name in _OPTIONAL if name in archive]
-                arrays = {name: archive[name] for name in (*_ARRAYS, *there)}
+                arrays = {name: archive[name] for name in archive if name != "header"}
             version, checksum = header["version"], header.pop("sha256")
         except Exception as error:
             whole = zipfile.is_zipfile(io.BytesIO(data))
@@ -122,8 +130,10 @@ class State:
             raise StateError(f"{path}: state format {version}; this version reads {VERSION}")
         if checksum != _checksum(header, arrays):
             raise StateError(f"{path}: checksum mismatch, damaged")
-        kept = ("identity", "film", "passes", "seconds", "statistics")
-        return State(**{name: header[name] for name in kept}, arrays=arrays)
+        chosen = {n.removeprefix(_CHOSEN): arrays.pop(n) for n in list(arrays) if _CHOSEN in n}
+        settled = Settled.unpacked(header["chosen"], chosen)
+        values = {name: header[name] for name in _IN_HEADER}
+        return State(**values, arrays=arrays, settled=settled)
 
     def check_same(self, identity: dict[str, Any], name: Any) -> None:
         """Raise StateError naming what differs unless this state's passes are passes of
@@ -152,7 +162,8 @@ def merge(states: dict[str, State]) -> State:
         arrays = {k: v + state.arrays[k] for k, v in arrays.items()}
         statistics = _merged(statistics, state.statistics)
         seconds += state.seconds
-    return State(first.identity, first.film, joined(passes), seconds, statistics, arrays)
+    ranges = joined(passes)
+    return State(first.identity, first.film, ranges, seconds, statistics, arrays, first.settled)
 
 
 def numbers(passes):
@@ -209,7 +220,7 @@ def joined(passes) -> list[list[int]]:
 
 def _checksum(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
     sha = hashlib.sha256(json.dumps(header, sort_keys=True, ensure_ascii=False).encode())
-    for name in (*_ARRAYS, *(name for name in _OPTIONAL if name in arrays)):
+    for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
         sha.update(f"{name} {array.dtype} {array.shape}".encode())
         sha.update(array.data)

@@ -162,7 +162,6 @@ def decide(
     radius,
     seed: int,
     each: int,
-    exactly: bool,
     seen: Seen,
     maps,
     light_paths,
@@ -171,7 +170,7 @@ def decide(
 
     scene        where the use of the map is open: with ``chosen`` "survey".
     radius       bandwidth of the first pass, world units, if it is given: all kernels have it.
-    each, exactly  see ``pilot.settle``.
+    each         see ``pilot.settle``.
     seen         by the pairs (see ``look``).
     maps         two independent photon maps of as many light paths, or empty ones.
     light_paths  of a pass if they are given, else 0 or None.
@@ -179,7 +178,7 @@ def decide(
     tiles = seen.tiles
     read = partial(_read, scene, sensor, radius, seed, tiles)
     filtered = noise_share(sensor.film())
-    longest = math.inf if exactly or scene.settings.passes else _LONGEST
+    longest = math.inf if scene.settings.passes else _LONGEST
     # What uses are compared after: the work of path tracing, whatever the length of their passes.
     total = PASSES * each * tiles.pixels * float(seen.work.mean())
     plan_of = partial(
@@ -211,7 +210,7 @@ def decide(
         return _survey(plan, {}, pixel_counts(plan, scene, sensor, seed), maps[0], seen.points)
 
     # --- The global map ---
-    first = take(seen.points, dr.compress(~seen.points.caustic))
+    first = take(seen.points, dr.compress(~seen.points.later))
     asks = _dearer(seen.points, _ASKS_PATH)
     found = read(maps, first, weigh)
     weight = weigh(found.light)
@@ -227,13 +226,12 @@ def decide(
     bare = plan_of(use="none", v_own=v_own, later=more)
     if bare.error < best.error:
         maps = [caustics(map_) for map_ in maps]
-        any_ = replace(seen.points, caustic=dr.opaque(mi.Bool, False, dr.width(seen.points.lane)))
-        found = read(maps, any_, lambda _: weight)
+        found = read(maps, seen.points, lambda _: weight)
         work = _GOING_ON * asks * seen.work
         plan = plan_of(use="caustic", v_own=v_own, found=found, later=more, work=work)
         errors["caustic"] = plan.error
         if plan.error < _BETTER * best.error:
-            best, chosen = plan, (maps[0], any_)
+            best, chosen = plan, (maps[0], seen.points)
         if scene.photons_are_dispensable:
             errors["none"] = None
             doubt = _doubt(seen.caustic, found.light, weight)

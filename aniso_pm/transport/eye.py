@@ -84,9 +84,9 @@ def _point(o: WalkOptions, v: Vertex) -> GatherPoints:
         origin=v.ray.o if o.general else None,
         d=v.ray.d if o.general else None,
         lambertian=v.lambertian if o.general else None,
-        caustic={"final_gather": ~v.scattered, "survey": v.scattered}.get(o.use),
+        caustic=~v.scattered if o.use == "final_gather" else None,
         distance=v.distance if o.measure else None,
-        later=v.scattered if o.light and o.use != "global" else None,
+        later=v.scattered if o.use == "survey" or (o.light and o.use != "global") else None,
     )
 
 
