@@ -134,8 +134,8 @@ class AnisoPhotonMapper:
 
      * - alpha
        - |float|
-       - The kernel's area shrinks by :math:`(i+\alpha)/(i+1)` after pass :math:`i`, above 0 and at
-         most 1. (Default: 2/3)
+       - The kernel's area in pass :math:`i`, counted from 0, is :math:`(i+\alpha)/(i+1)` times that
+         of the pass before; above 0 and at most 1. (Default: 2/3)
 
      * - gather_tolerance
        - |float|
@@ -211,11 +211,12 @@ class AnisoPhotonMapper:
     Before ``render()`` these attributes may be set: ``progress``, a function (done, total, text)
     that is called after each wavefront (see ``aniso_pm.progress.bar``); ``callback``, a function
     (pass_index, image, statistics) that is called after each pass with the picture so far, when
-    ``variance`` and ``layers`` hold those so far;
-    ``checkpoint``, an ``aniso_pm.state.Checkpoint`` that keeps the state of the rendering in a file
-    from which it can be resumed; ``first_pass``, the number of the first pass. Pass i is the same
-    whatever passes are rendered before or after it, or none; ``elsewhere``, who renders the passes
-    instead of this process (see ``aniso_pm.distributed``).
+    ``layers`` holds those so far and ``variance`` the estimate after each of the first 20 passes,
+    then after every twentieth of their number; ``checkpoint``, an ``aniso_pm.state.Checkpoint``
+    that keeps the state of the rendering in a file from which it can be resumed; ``first_pass``,
+    the number of the first pass. Pass i is the same whatever passes are rendered before or after
+    it, or none; ``elsewhere``, who renders the passes instead of this process (see
+    ``aniso_pm.distributed``).
 
     In spectral variants all photons and eye paths of a pass share four wavelengths, stratified over
     the passes: give at least 16 passes.

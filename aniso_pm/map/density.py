@@ -258,9 +258,11 @@ class Surface:
 
 @dr.syntax
 def probe_surface(
-    scene, seed: int, points: GatherPoints, kernel: PlaneKernel, thickness, active, cover=None
+    scene, seed, points: GatherPoints, kernel: PlaneKernel, thickness, active, cover=None
 ):
     """(1/m, nothing found?): the inverse share of each kernel that lies on the surface.
+
+    seed: a number, or mi.UInt32.
 
     cover: a function of (mi.BSDFPtr, active) as ``receivers.read_cover``; None where every surface
     gathers and none lets light pass.

@@ -23,10 +23,10 @@ class PhotonMap:
     """Photons in the order of their spatial index.
 
     emitted    light paths traced: the estimate divides by it.
-    stored     photons in the map; 0 means that the arrays are None.
+    stored     photons in the map; 0 means that the arrays are None (but see ``numbered``).
     rejected   fluxes that were not finite and were dropped: photons, and light paths that end.
-    index      word of a point: octahedral normal in 24 bits, number of path segments in 7, caustic
-               or not in the highest.
+    index      index.Index, or None. The word of a point: octahedral normal in 24 bits, number of
+               path segments in 7, caustic or not in the highest.
     flux       W, interleaved channels, padded to a power of two.
     direction  where the light came from, 32 bits octahedral; None where no receiver needs it.
     wavelengths  nm, in spectral variants; the flux is W/nm then.
@@ -45,8 +45,8 @@ class PhotonMap:
     origins: Origins | None = None
 
     def numbered(self) -> PhotonMap:
-        """The same for gathering: what differs from map to map as arrays, which are no part of what
-        is traced, and the rest left out."""
+        """The same for gathering alone: what differs from map to map as arrays, which are no part
+        of what is traced, and the rest left out (``stored``, ``rejected``: 0)."""
         index = self.index
         count, leaves = (dr.opaque(mi.UInt32, v) for v in (index.count, index.n_leaves))
         return replace(

@@ -37,7 +37,7 @@ class Wall:
 
 
 @dr.syntax
-def nearest(scene, seed: int, points, kernel: PlaneKernel, reach: float, lift, passes=None):
+def nearest(scene, seed, points, kernel: PlaneKernel, reach: float, lift, passes=None):
     """Wall of each gather point.
 
     reach   of the kernel in units of its half axes; lift: height of the rays above the surface,

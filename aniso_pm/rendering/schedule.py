@@ -15,7 +15,8 @@ OPEN_PASS, LARGE_PASS = 1 << 19, 1 << 21
 
 
 def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
-    """Kernel radius of pass ``index`` (0-based): r² shrinks by (i + α)/(i + 1) after pass i.
+    """Kernel radius of pass ``index`` (0-based): r² of pass i >= 1 is (i + α)/(i + 1) times that of
+    the pass before.
 
     ∏ (i + α)/(i + 1) for i = 1 … index is Γ(index + 1 + α) / (Γ(1 + α) Γ(index + 2)).
     """

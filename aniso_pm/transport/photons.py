@@ -44,8 +44,8 @@ from .rays import reach_of, spawn_ray
 
 # Light paths traced at once: bounds the memory of a wavefront, not the number of photons.
 WAVEFRONT = 1 << 21
-# Photons a path for the first guess of the buffer size; later maps start from the last count.
-_FIRST_GUESS = 2.0
+# Photons a path that there is room for at least: buffers of one size are traced and replayed once.
+_ROOM = 2.0
 
 
 @dataclass  # not frozen: Dr.Jit writes back whatever a loop mentions
@@ -94,7 +94,7 @@ def build_map(
     lap       called with the name of each stage that ends.
     wavefront  light paths traced at once; None: WAVEFRONT.
     """
-    room = max(expected, int(_FIRST_GUESS * photon_count))
+    room = max(expected, int(_ROOM * photon_count))
     stored, rejected, photons = _trace(
         scene,
         source,
