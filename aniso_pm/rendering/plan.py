@@ -199,12 +199,12 @@ class Plan:
             else:
                 area = np.ones(len(whole))
             thinner = aimed * found.emitted / (paths * area)
-            gather = _GATHER * found.points
-            gather += _MET * met * float(area.mean()) * paths / found.emitted
+            every = _GATHER * found.points  # work, were all eye paths to gather
+            every += _MET * met * float(area.mean()) * paths / found.emitted
             if v_eye > 0:
-                share = noise.share(thinner, eye_work / (v_eye * gather), each)
+                share = noise.share(thinner, eye_work / (v_eye * every), each)
             eye_noise = max(v_eye + float((noise.gather / share).mean()), 1e-30)
-            gather *= float(share.mean())
+            gather = every * float(share.mean())
             by_photons = max(0.0, float((b_1 / widths**2).mean()))
             if not light_paths:
                 costs = (eye_work + gather) / (light * tiles.pixels)

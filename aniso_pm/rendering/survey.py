@@ -18,6 +18,7 @@ larger the fewer hits they were, or where these are next to none.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -176,8 +177,6 @@ def decide(
     light_paths  of a pass if they are given, else 0 or None.
     """
     tiles = seen.tiles
-    read = partial(_read, scene, sensor, radius, seed, tiles)
-    filtered = noise_share(sensor.film())
     longest = math.inf if scene.settings.passes else _LONGEST
     # What uses are compared after: the work of path tracing, whatever the length of their passes.
     total = PASSES * each * tiles.pixels * float(seen.work.mean())
@@ -188,82 +187,110 @@ def decide(
         tiles=tiles,
         choose=radius is None,
         light_paths=light_paths,
-        filtered=filtered,
+        filtered=noise_share(sensor.film()),
         total=total,
         whole=seen.work,
     )
+    read = partial(_read, scene, sensor, radius, seed, tiles)
+    pilot = _Pilot(scene, sensor, seed, seen, maps, read, plan_of)
     if seen.points is None or not min(map_.stored for map_ in maps):
-        use = scene.use
+        return pilot.nothing_to_read()
+    return pilot.best_use() if scene.use == "survey" else pilot.given_use()
+
+
+@dataclass(frozen=True)
+class _Pilot:
+    """What was seen, and how plans follow from it.
+
+    scene, sensor, seed, seen, maps  as for ``decide``.
+    read     ``_read`` of these, a function of maps, points and weigh.
+    plan_of  ``Plan.of`` with what is the same for every use.
+    """
+
+    scene: Prepared
+    sensor: Any
+    seed: int
+    seen: Seen
+    maps: Any
+    read: Callable[..., Found]
+    plan_of: Callable[..., Plan]
+
+    def nothing_to_read(self) -> Survey:
+        """No path reads a map, or a map is empty."""
+        seen, use = self.seen, self.scene.use
         if use == "survey":
-            use = "none" if scene.photons_are_dispensable else "caustic"
+            use = "none" if self.scene.photons_are_dispensable else "caustic"
         light = seen.own + seen.later + (0 if use == "caustic" else seen.caustic)
-        weight = tiles.weight(light)
-        plan = plan_of(use=use, weight=weight, v_own=within(light, light, weight))
-        return _survey(plan, {}, pixel_counts(plan, scene, sensor, seed), None, None)
-    own = seen.own
-    weigh = lambda gathered: tiles.weight(own + gathered)  # noqa: E731
-    if scene.use != "survey":
-        found = read(maps, seen.points, weigh)
-        weight = weigh(found.light)
-        v_own = within(own, own, weight)
-        plan = plan_of(use=scene.use, weight=weight, v_own=v_own, found=found)
-        return _survey(plan, {}, pixel_counts(plan, scene, sensor, seed), maps[0], seen.points)
+        weight = seen.tiles.weight(light)
+        plan = self.plan_of(use=use, weight=weight, v_own=within(light, light, weight))
+        return self._survey(plan, {}, None, None)
 
-    # --- The global map ---
-    first = take(seen.points, dr.compress(~seen.points.later))
-    asks = _dearer(seen.points, _ASKS_PATH)
-    found = read(maps, first, weigh)
-    weight = weigh(found.light)
-    v_own = within(own, own, weight)
-    plan_of = partial(plan_of, weight=weight)
-    best = plan_of(use="global", v_own=v_own, found=found, work=asks * seen.early)
-    errors: dict[str, float | None] = {"global": best.error}
-    chosen: tuple[Any, Any] = maps[0], first
+    def given_use(self) -> Survey:
+        """The use of the map is not open."""
+        found, plan_of, _ = self._of_reading(self.seen.points)
+        plan = plan_of(use=self.scene.use, found=found)
+        return self._survey(plan, {}, self.maps[0], self.seen.points)
 
-    # --- The other ones, unless their eye paths alone are too dear ---
-    light = own + seen.later
-    more = within(light, light, weight) - v_own
-    bare = plan_of(use="none", v_own=v_own, later=more)
-    if bare.error < best.error:
-        maps = [caustics(map_) for map_ in maps]
-        found = read(maps, seen.points, lambda _: weight)
+    def best_use(self) -> Survey:
+        """That which promises the least error."""
+        seen = self.seen
+        first = take(seen.points, dr.compress(~seen.points.later))
+        found, plan_of, weight = self._of_reading(first)
+        asks = _dearer(seen.points, _ASKS_PATH)
+        best = plan_of(use="global", found=found, work=asks * seen.early)
+        errors: dict[str, float | None] = {"global": best.error}
+        read: tuple[Any, Any] = self.maps[0], first
+
+        # --- The other ones, unless their eye paths alone are too dear ---
+        light = seen.own + seen.later
+        later = within(light, light, weight) - within(seen.own, seen.own, weight)
+        if plan_of(use="none", later=later).error >= best.error:
+            return self._survey(best, errors, *read)
+        maps = [caustics(map_) for map_ in self.maps]
+        found = self.read(maps, seen.points, lambda _: weight)
         work = _GOING_ON * asks * seen.work
-        plan = plan_of(use="caustic", v_own=v_own, found=found, later=more, work=work)
+        plan = plan_of(use="caustic", found=found, later=later, work=work)
         errors["caustic"] = plan.error
         if plan.error < _BETTER * best.error:
-            best, chosen = plan, (maps[0], seen.points)
-        if scene.photons_are_dispensable:
+            best, read = plan, (maps[0], seen.points)
+        if self.scene.photons_are_dispensable:
             errors["none"] = None
             doubt = _doubt(seen.caustic, found.light, weight)
             if doubt:
-                light = light + seen.caustic
-                with_caustics = within(light, light, weight) - v_own
-                more = more + doubt * (with_caustics - more)
-                plan = plan_of(use="none", v_own=v_own, later=more)
+                all_ = light + seen.caustic
+                of_caustics = within(all_, all_, weight) - within(light, light, weight)
+                plan = plan_of(use="none", later=later + doubt * of_caustics)
                 errors["none"] = plan.error
                 if plan.error < best.error:
-                    best, chosen = plan, (None, None)
-    return _survey(best, errors, pixel_counts(best, scene, sensor, seed), *chosen)
+                    best, read = plan, (None, None)
+        return self._survey(best, errors, *read)
 
+    def _of_reading(self, points) -> tuple[Found, Callable[..., Plan], Any]:
+        """(what is found at the points, plans, weight of each pair) that go by all light there."""
+        own, weigh = self.seen.own, self.seen.tiles.weight
+        found = self.read(self.maps, points, lambda gathered: weigh(own + gathered))
+        weight = weigh(own + found.light)
+        plan_of = partial(self.plan_of, weight=weight, v_own=within(own, own, weight))
+        return found, plan_of, weight
 
-def _survey(plan: Plan, errors, counts, map_, points) -> Survey:
-    share, widths = (
-        plan.tiles.to_pixels(plan.tiles.grid(v)) if v.size > 1 else v
-        for v in (plan.share, plan.widths)
-    )
-    return Survey(
-        use=plan.use,
-        errors=errors,
-        each=plan.each,
-        share=share,
-        light_paths=plan.light_paths,
-        counts=counts,
-        widths=widths,
-        aim=plan.aim,
-        lobes=plan.lobes,
-        map=map_,
-        points=points,
-    )
+    def _survey(self, plan: Plan, errors, map_, points) -> Survey:
+        share, widths = (
+            plan.tiles.to_pixels(plan.tiles.grid(v)) if v.size > 1 else v
+            for v in (plan.share, plan.widths)
+        )
+        return Survey(
+            use=plan.use,
+            errors=errors,
+            each=plan.each,
+            share=share,
+            light_paths=plan.light_paths,
+            counts=pixel_counts(plan, self.scene, self.sensor, self.seed),
+            widths=widths,
+            aim=plan.aim,
+            lobes=plan.lobes,
+            map=map_,
+            points=points,
+        )
 
 
 def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray | None:
