@@ -31,7 +31,7 @@ def _variant(variant_llvm_rgb):
 def plan(definition, max_memory=0.0, pixels=256**2, samples=1 << 21, stored=1e6, **settings):
     scene = prepare(mi.load_dict(definition), Settings(max_memory=max_memory, **settings), False)
     job = memory.Job(stored, pixels, 4, False, samples)
-    return memory.plan(scene, job, lambda: stored)
+    return memory.fitting(scene, job, lambda: stored)
 
 
 def picture(definition, spp=16, seed=0, **parameters):
@@ -113,7 +113,7 @@ def test_the_bound_of_photons_holds_and_the_measured_number_is_right():
 def test_nothing_is_split_and_nothing_measured_where_memory_suffices():
     scene = prepare(mi.load_dict(room(size=4)), Settings(max_memory=16.0), False)
     job = memory.Job(1e6, 16, 4, False, 1 << 21)
-    found = memory.plan(scene, job, lambda: pytest.fail("the bound fits"))
+    found = memory.fitting(scene, job, lambda: pytest.fail("the bound fits"))
     assert (found.light_paths, found.eye_samples) == (photons.WAVEFRONT, 1 << 21)
 
 
@@ -147,7 +147,7 @@ def test_parts_of_the_film_are_the_picture_of_the_whole(monkeypatch, film, sampl
     stored = 40_000 * pilot.photons_per_path(scene, 0)
     job = memory.Job(stored, (36 + border) ** 2, 4, False, 16 * (36 + border) ** 2)
     monkeypatch.setattr(memory, "SMALLEST", 500)
-    limit = memory.Plan(scene, job, 20_000, 700).bytes
+    limit = memory.Wavefronts(scene, job, 20_000, 700).bytes
     parts, small = picture(definition, max_memory=limit / GIB)
     s, t = plugin.statistics, small.statistics
     assert t["wavefront_eye_samples"] < 36**2 < s["wavefront_eye_samples"]

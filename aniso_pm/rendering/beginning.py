@@ -34,7 +34,7 @@ class Decided:
     shares     samples of each pass; allotment: of each pixel.
     gathers    share of the eye paths of each pixel that gather (mi.Float); None: all do.
     layered    layers that are summed, or None.
-    plan       wavefronts that fit into the memory.
+    wavefronts  that fit into the memory.
     variance   is the spread of passes kept?
     replayed   passes are traced in Python once and then replayed.
     """
@@ -45,7 +45,7 @@ class Decided:
     allotment: Allotment
     gathers: Any
     layered: Layered | None
-    plan: memory.Plan
+    wavefronts: memory.Wavefronts
     variance: bool
     replayed: bool
 
@@ -53,7 +53,7 @@ class Decided:
     def wavefront(self) -> int:
         """Most eye samples at once."""
         room = max(self.allotment.pixels, WAVEFRONT // self.scene.crowding)
-        return min(room, self.plan.eye_samples)
+        return min(room, self.wavefronts.eye_samples)
 
     def identity(self, sensor, seed: int) -> dict[str, Any]:
         """What a state has to agree in, to be gone on from (see ``digest``)."""
@@ -80,9 +80,9 @@ class Decided:
             "map_errors": settled.errors,
             "kernel": "anisotropic" if self.scene.follow_lobes else "isotropic",
             "error_behind_lobes": settled.lobes,
-            "memory_estimate": self.plan.bytes / memory.GIB,
-            "wavefront_light_paths": self.plan.light_paths,
-            "wavefront_eye_samples": self.plan.eye_samples,
+            "memory_estimate": self.wavefronts.bytes / memory.GIB,
+            "wavefront_light_paths": self.wavefronts.light_paths,
+            "wavefront_eye_samples": self.wavefronts.eye_samples,
             "replayed": self.replayed,
         }
 
@@ -118,8 +118,8 @@ def decide(
     # Variances are worth their memory where there can be any, now or after a merge.
     kept = controls.checkpoint is not None or controls.settled is not None
     variance = kept or settings.passes != 1
-    plan = memory.plan(scene, *_job(scene, film, seed, share, layered, variance))
-    scene = replace(scene, light_wavefront=plan.light_paths)
+    wavefronts = memory.fitting(scene, *_job(scene, film, seed, share, layered, variance))
+    scene = replace(scene, light_wavefront=wavefronts.light_paths)
     if not settings.initial_radius:
         pixel = footprint.of(sensor, settled.radius, settled.widths)
         scene = replace(scene, footprint=pixel)
@@ -129,7 +129,9 @@ def decide(
     replayed = settings.passes != 1 and scene.replays
     counts = None if settled.counts is None else settled.counts.astype(np.int64)
     allotment = Allotment(pixels, settled.each, counts)
-    return Decided(scene, settled, share, allotment, gathers, layered, plan, variance, replayed)
+    return Decided(
+        scene, settled, share, allotment, gathers, layered, wavefronts, variance, replayed
+    )
 
 
 def _settle(

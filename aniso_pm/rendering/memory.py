@@ -62,7 +62,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Wavefronts:
     """A job in wavefronts of at most so many light paths and eye samples."""
 
     scene: Prepared
@@ -93,7 +93,7 @@ class Plan:
         """The sum of all parts."""
         return sum(self.parts.values())
 
-    def with_stored(self, stored: float) -> Plan:
+    def with_stored(self, stored: float) -> Wavefronts:
         """The same wavefronts with that many photons."""
         return replace(self, job=replace(self.job, stored=stored))
 
@@ -107,7 +107,7 @@ def _points_per_sample(scene: Prepared) -> float:
     return 1.2 if scene.use == "final_gather" or scene.needs.general else 1
 
 
-def plan(scene: Prepared, job: Job, count_photons: Callable[[], float]) -> Plan:
+def fitting(scene: Prepared, job: Job, count_photons: Callable[[], float]) -> Wavefronts:
     """Wavefronts with which ``job`` fits into the parameter ``max_memory``.
 
     job            its ``stored`` is an upper bound.
@@ -116,7 +116,7 @@ def plan(scene: Prepared, job: Job, count_photons: Callable[[], float]) -> Plan:
     Raises Unsupported where no wavefront is small enough.
     """
     limit, said = _limit(scene.settings.max_memory)
-    result = Plan(scene, job, photons.WAVEFRONT, job.samples)
+    result = Wavefronts(scene, job, photons.WAVEFRONT, job.samples)
     if result.bytes <= limit:
         return result
     result = result.with_stored(count_photons())
@@ -139,8 +139,8 @@ def _half(lanes: int) -> int:
     return 1 << ((lanes - 1).bit_length() - 1)
 
 
-def _refusal(plan: Plan, said: str) -> str:
-    job, parts = plan.job, plan.parts
+def _refusal(smallest: Wavefronts, said: str) -> str:
+    job, parts = smallest.job, smallest.parts
     flights = parts["light paths"] + parts["eye samples"] + parts["kernels"]
     shown = {f"the film of {job.pixels} pixels": parts["film"], "the smallest wavefronts": flights}
     if job.stored:
@@ -149,7 +149,7 @@ def _refusal(plan: Plan, said: str) -> str:
     remedy = '"photon_count"' if parts["photons"] > parts["film"] else "the size of the film"
     return (
         f'aniso_pm: parameter "max_memory" is {said}, but rendering takes about '
-        f"{_gib(plan.bytes)} GiB ({each}); lower {remedy} or give a larger max_memory"
+        f"{_gib(smallest.bytes)} GiB ({each}); lower {remedy} or give a larger max_memory"
     )
 
 

@@ -304,7 +304,8 @@ def _scattered(total, lanes, values):
 
 
 def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
-    """Read the scene. Raises Unsupported with one sentence where it cannot be rendered."""
+    """Read the scene, and mend what Mitsuba gets wrong of it (``transport.amends``). Raises
+    Unsupported with one sentence where it cannot be rendered."""
     if mi.is_polarized:
         raise Unsupported(
             f'aniso_pm: variant "{mi.variant()}" is not supported (photons carry no '

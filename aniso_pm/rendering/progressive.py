@@ -158,11 +158,11 @@ class Run:
             self.done = self.done.with_pass(index, traced, self.decided.variance)
             self.tracer.unfinished = None
             self.radius = self.tracer.radius
-            estimate = self.decided.plan.with_stored(self.tracer.photons).bytes / memory.GIB
+            stored = self.decided.wavefronts.with_stored(self.tracer.photons)
             self.statistics |= {
                 **self.done.counts,
                 "radius": self.radius,
-                "memory_estimate": estimate,
+                "memory_estimate": stored.bytes / memory.GIB,
                 "replayed": self.tracer.replayed,
             }
             self._check_error()
