@@ -153,9 +153,10 @@ def _root(score, work):
 def _boxes(numbers, score, more_work, idle_work):
     """(low, size, box of each path, score by the box that each was a half of). idle_work: of all
     paths if they were idle; more_work: than that, of each of these."""
-    low, size = np.zeros((1, 5)), np.ones((1, 5))
+    low: np.ndarray = np.zeros((1, 5))
+    size: np.ndarray = np.ones((1, 5))
     inherited = np.array([score.sum()])
-    box = np.zeros(len(score), np.int64)
+    box: np.ndarray = np.zeros(len(score), np.int64)
     whole = np.sqrt(score.sum() * (more_work.sum() + idle_work))
     is_open = np.array([True])  # may the box be halved?
     place = numbers.T.copy()  # of each path in its box, 0 to 1
@@ -193,7 +194,7 @@ def _boxes(numbers, score, more_work, idle_work):
         low[new, dimension] += size[new, dimension]
         inherited[which] = 0.5 * sums[which]
         inherited = np.concatenate([inherited, inherited[which]])
-        target = np.arange(len(best))
+        target: np.ndarray = np.arange(len(best))
         target[which] = new
         across = best[box]
         above = upper[across, path]
