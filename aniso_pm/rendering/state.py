@@ -103,8 +103,8 @@ class State:
 
     def save(self, path: Path) -> None:
         """Write atomically, down to the disk. Raises ``output.OutputError``."""
-        chosen, fields_ = self.settled.packed()
-        arrays = self.arrays | {_CHOSEN + name: array for name, array in fields_.items()}
+        chosen, per_pixel = self.settled.packed()
+        arrays = self.arrays | {_CHOSEN + name: array for name, array in per_pixel.items()}
         header = {name: getattr(self, name) for name in _IN_HEADER} | {"chosen": chosen}
         header = output.plain(header) | {"format": "aniso_pm state", "version": VERSION}
         header["sha256"] = _checksum(header, arrays)
@@ -130,7 +130,8 @@ class State:
             raise StateError(f"{path}: state format {version}; this version reads {VERSION}")
         if checksum != _checksum(header, arrays):
             raise StateError(f"{path}: checksum mismatch, damaged")
-        chosen = {n.removeprefix(_CHOSEN): arrays.pop(n) for n in list(arrays) if _CHOSEN in n}
+        names = [name for name in arrays if name.startswith(_CHOSEN)]
+        chosen = {name.removeprefix(_CHOSEN): arrays.pop(name) for name in names}
         settled = Settled.unpacked(header["chosen"], chosen)
         values = {name: header[name] for name in _IN_HEADER}
         return State(**values, arrays=arrays, settled=settled)
