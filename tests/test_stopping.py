@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from aniso_pm.rendering.settings import Settings
+from aniso_pm.rendering.state import Checkpoint
 from aniso_pm.rendering.stopping import Stopping
 from passes import SMALL, integrator, load, render
 from rooms import room
@@ -60,6 +61,16 @@ def test_the_number_of_passes_still_ends_a_long_budget():
     plugin = integrator(time=1000.0, passes=3)
     render(load(), plugin, 6)
     assert plugin.statistics["passes"] == 3 and plugin.statistics["spp"] == 6
+
+
+def test_writing_a_state_does_not_decide_when_the_error_is_small_enough(monkeypatch, tmp_path):
+    """The estimate that a state comes with is not one that a rendering ends by."""
+    monkeypatch.setattr(Stopping, "error_is_due", lambda self, count: count % 7 == 0)
+    monkeypatch.setattr(Checkpoint, "due", lambda self: True)
+    for checkpoint in (None, Checkpoint(tmp_path / "a.state")):
+        plugin = integrator(target_error=0.9)
+        render(load(), plugin, 2, checkpoint=checkpoint)
+        assert plugin.statistics["passes"] == 7
 
 
 def test_target_error_ends_rendering_where_it_says():
