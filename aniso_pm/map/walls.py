@@ -56,7 +56,7 @@ def nearest(scene, seed, points, kernel: PlaneKernel, reach: float, lift, passes
         length = dr.norm(along)
         ray = mi.Ray3f(points.p + n * lift, along / length)
         ray.maxt = length * farthest
-        si = scene.ray_intersect(ray, mi.RayFlags.Minimal, True, True)
+        si = scene.ray_intersect(ray, mi.RayFlags.Minimal, False, True)
         met = si.is_valid() & (dr.abs(dr.dot(si.n, n)) < NORMAL_COS)
         if dr.hint(passes is not None, mode="scalar"):
             met &= ~passes(si.bsdf(), met)
