@@ -324,6 +324,7 @@ def gather(index: Index, ellipses: Ellipses, cut2: float, visit, total, active, 
             rho2 = da * da + db * db
             inside = (rho2 <= cut2) & (dr.abs(dr.dot(c, d)) <= 1)
             word = dr.reinterpret_array(mi.UInt32, point.w)
-            total = visit(total, slot, word, d, rho2, inside)
+            if inside:
+                total = visit(total, slot, word, d, rho2, inside)
             k += 1
     return total

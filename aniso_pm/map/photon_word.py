@@ -41,12 +41,18 @@ def one_sheet(word, n, d, rounding):
     """May a surface go smoothly from a point to the photon at the offset d from it? On quadrics
     (n + n')·d = 0, for the photon's normal n'; between parallel sheets at the distance h it is 2h.
     rounding: of offsets, world units."""
-    return smooth_between(n, decode(word, 12), d, rounding)
+    v = _octahedral(word, 12)
+    return _bends(dr.fma(dr.dot(v, d), dr.rsqrt(dr.squared_norm(v)), dr.dot(n, d)), d, rounding)
 
 
 def smooth_between(n, other, d, rounding):
     """The same for a normal that is known."""
-    return dr.abs(dr.dot(n + other, d)) <= BEND * dr.norm(d) + rounding
+    return _bends(dr.dot(n + other, d), d, rounding)
+
+
+def _bends(off, d, rounding):
+    """Is (n + n')·d no more than a smooth surface may have?"""
+    return dr.square(off) <= dr.square(BEND) * dr.squared_norm(d) + dr.square(rounding)
 
 
 def encode(v, bits):
