@@ -66,7 +66,7 @@ def without_pilot(request, monkeypatch):
 
 
 def leave_out_the_pilot(monkeypatch):
-    def settled(scene, sensor, seed, each, exactly=False):
+    def settled(scene, sensor, seed, each):
         use = "global" if scene.undecided else scene.use
         count = scene.settings.photon_count or 10_000
         radius = scene.settings.initial_radius or 0.02 * scene.extent

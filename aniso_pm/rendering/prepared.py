@@ -18,6 +18,7 @@ from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
 from ..transport.amends import repair_bounds
 from ..transport.focus import Focus
+from ..transport.lamps import Lamps
 from ..transport.walk import WalkOptions
 from . import gathering, replay
 from .decisions import Decisions
@@ -71,6 +72,7 @@ class Prepared(Decisions):
     light_wavefront: int | None = None  # light paths at once; None: photons.WAVEFRONT
     footprint: Footprint | None = None  # of pixels; None: one bandwidth for all of a pass
     aim: Aim | None = None  # of light paths, if a pilot has found that it pays
+    lamps: Lamps | None = None  # where emitters are; None: anywhere
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -169,6 +171,8 @@ class Prepared(Decisions):
             thinning=thinning,
             light=for_layers and self.light_layers,
             surface=for_layers and self.surface_layers,
+            # With the other uses paths go on in any case.
+            lamps=self.lamps if self.use in ("global", "final_gather") else None,
         )
         launch = self.launch.eye
         if watch:  # what watches cannot be frozen
@@ -320,7 +324,8 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
     repair_bounds(scene)  # before light from outside is aimed at them
     needs = read_scene(scene, settings.gather_roughness)
     source = emission.prepare(scene) if scene.emitters() else None
-    prepared = Prepared(scene, needs, settings, hide_emitters, source)
+    lamps = Lamps.of(scene)
+    prepared = Prepared(scene, needs, settings, hide_emitters, source, lamps=lamps)
     radius, extent = settings.initial_radius, prepared.extent
     if radius and scene.shapes() and not 1e-7 * extent <= radius <= 10 * extent:
         raise Unsupported(

@@ -17,6 +17,7 @@ from ..lobe_path import GlossyVertex, follow, no_lobe
 from ..map.receivers import gathered_part, read_receiver
 from ..map.spectra import channel_mean
 from . import layers
+from .lamps import Lamps
 from .rays import reach_of, spawn_ray
 from .survey_parts import Apart
 from .thinning import Thinning
@@ -42,6 +43,7 @@ class WalkOptions:
     thinning       which paths leave gather points; None: all do.
     light          split light by how it came (see ``layers``).
     surface        keep what is seen.
+    lamps          where emitters are; None: anywhere.
     """
 
     use: Use
@@ -58,6 +60,7 @@ class WalkOptions:
     thinning: Thinning | None = None
     light: bool = False
     surface: bool = False
+    lamps: Lamps | None = None
 
 
 class Vertex(NamedTuple):
@@ -195,7 +198,10 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
         si_prev = mi.Interaction3f(si)
         pdf_prev = bs.pdf
         delta_prev = delta
-        active &= (dr.max(β) > 0) | (dr.max(β_direct) > 0)
+        goes_on, may_end = dr.max(β) > 0, dr.max(β_direct) > 0
+        if dr.hint(o.lamps is not None, mode="scalar"):
+            may_end &= goes_on | o.lamps.may_meet(ray)
+        active &= goes_on | may_end
 
         # --- Russian roulette, for paths that go on ---
         if dr.hint(o.deep or o.use != "global", mode="scalar"):
