@@ -103,10 +103,10 @@ class AnisoPhotonMapper:
        - |int|
        - Number of passes with fresh photons and fresh eye paths; the samples per pixel are the
          total over all passes, shared evenly. 0 is without limit: passes go on until ``time`` or
-         ``target_error`` ends them, and each takes the samples per pixel that are given, but no
-         more than make 524,288 eye samples in all (in large pictures up to four a pixel, while
-         these are no more than 2,097,152), fewer where it has many light paths, and at least one
-         a pixel.
+         ``target_error`` ends them, and each takes the samples per pixel that are given (at least
+         8 where only the scene's sampler says how many), but no more than make 524,288 eye samples
+         in all (in large pictures up to four a pixel, while these are no more than 2,097,152),
+         fewer where it has many light paths, and at least one a pixel.
          (Default: 1, or 0 where ``time`` or ``target_error`` is given)
 
      * - time

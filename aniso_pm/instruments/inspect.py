@@ -13,7 +13,7 @@ from ..rendering.history import recorded
 from ..rendering.needs import emitter_name
 from ..rendering.pilot import camera_rays, settle
 from ..rendering.prepared import Prepared
-from ..rendering.schedule import shares
+from ..rendering.schedule import sample_count, shares
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,15 @@ def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
             "light paths are shared by power" if len(emitters) > 1 else "nothing to choose",
             emitters or ["the scene has no emitters"],
         ),
+        _direct_light(scene),
+        Finding(
+            "paths towards lamps only",
+            scene.lamps is not None,
+            "eye paths that can only end at an emitter go on towards boxes around these"
+            if scene.lamps
+            else "light may come from anywhere",
+            [],
+        ),
         _environment(scene),
         _focus(scene),
         Finding(
@@ -137,6 +146,18 @@ def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
         ),
     ]
     return [*findings, kernels(scene)] if compile_ else findings
+
+
+def _direct_light(scene: Prepared) -> Finding:
+    """Which emitters eye paths ask."""
+    name, direct, emitters = "direct light", scene.direct, scene.scene.emitters()
+    if direct is not None:
+        groups = f"{len(emitters)} emitters in {len(direct.groups)} groups"
+        why = "emitters are asked by what they may give at the place"
+        return Finding(name, True, why, [groups])
+    weights = {e.sampling_weight() for e in emitters}
+    why = "nothing to choose" if len(weights) < 2 else "emitters are asked by their sampling_weight"
+    return Finding(name, False, why, [])
 
 
 def _focus(scene: Prepared) -> Finding:
@@ -198,7 +219,7 @@ def decided(scene: Prepared) -> tuple[Prepared, list[str], str, float]:
         causes = ["nothing casts caustics"] if scene.settings.map == "auto" else []
         return scene, [f"map=auto: {cause}" for cause in causes], "there are no light paths", 0.0
     sensor = scene.scene.sensors()[0]
-    spp, pixels = sensor.sampler().sample_count(), pixel_count(sensor.film())
+    spp, pixels = sample_count(scene.settings, 0, sensor), pixel_count(sensor.film())
     found = settle(scene, sensor, 0, shares(scene.settings, spp, pixels).each)
     why = []
     if scene.undecided:

@@ -18,7 +18,7 @@ from .controls import Controls
 from .layered import Layered
 from .pilot import photons_per_path, settle
 from .prepared import Prepared
-from .schedule import Shares, shares
+from .schedule import Shares, sample_count, shares
 from .settled import Settled
 
 # Eye samples traced at once, where there is memory for them (see ``memory``).
@@ -99,7 +99,7 @@ def decide(
     """
     film, settings = sensor.film(), scene.settings
     pixels = films.pixel_count(film)
-    share = shares(settings, spp or sensor.sampler().sample_count(), pixels, controls.first_pass)
+    share = shares(settings, sample_count(settings, spp, sensor), pixels, controls.first_pass)
     layered = Layered.of(film, settings.layer_names)
     advice.before(scene)
     films.begin(film, bool(controls.callback or controls.checkpoint))

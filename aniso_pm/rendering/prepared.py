@@ -17,6 +17,7 @@ from ..map.photon_map import EMPTY, PhotonMap
 from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
 from ..transport.amends import repair_bounds
+from ..transport.direct_light import DirectLight
 from ..transport.focus import Focus
 from ..transport.lamps import Lamps
 from ..transport.walk import WalkOptions
@@ -73,6 +74,7 @@ class Prepared(Decisions):
     footprint: Footprint | None = None  # of pixels; None: one bandwidth for all of a pass
     aim: Aim | None = None  # of light paths, if a pilot has found that it pays
     lamps: Lamps | None = None  # where emitters are; None: anywhere
+    direct: DirectLight | None = None  # how emitters are drawn; None: as Mitsuba does
 
     def with_(self, **changes) -> Prepared:
         """The same scene with some parameters changed."""
@@ -173,6 +175,7 @@ class Prepared(Decisions):
             surface=for_layers and self.surface_layers,
             # With the other uses paths go on in any case.
             lamps=self.lamps if self.use in ("global", "final_gather") else None,
+            direct=self.direct,
         )
         launch = self.launch.eye
         if watch:  # what watches cannot be frozen
@@ -324,8 +327,8 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
     repair_bounds(scene)  # before light from outside is aimed at them
     needs = read_scene(scene, settings.gather_roughness)
     source = emission.prepare(scene) if scene.emitters() else None
-    lamps = Lamps.of(scene)
-    prepared = Prepared(scene, needs, settings, hide_emitters, source, lamps=lamps)
+    lamps, direct = Lamps.of(scene), DirectLight.of(scene, source)
+    prepared = Prepared(scene, needs, settings, hide_emitters, source, lamps=lamps, direct=direct)
     radius, extent = settings.initial_radius, prepared.extent
     if radius and scene.shapes() and not 1e-7 * extent <= radius <= 10 * extent:
         raise Unsupported(

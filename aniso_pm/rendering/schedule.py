@@ -12,6 +12,9 @@ from .settings import Settings
 # Eye samples of a pass where the number of passes is open: short against any budget. More where
 # that would be less than FEW a pixel, up to LARGE_PASS.
 OPEN_PASS, LARGE_PASS = 1 << 19, 1 << 21
+# Samples per pixel of such a pass where nobody but the scene's sampler says how many: that of
+# Mitsuba takes 4 by itself, and passes so small have up to half again the error after a time.
+_SEVERAL = 8
 
 
 def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
@@ -39,6 +42,15 @@ class Shares:
         """Samples per pixel of all passes from number 0 to that before ``index``."""
         more = min(max(index - self.one_more.start, 0), len(self.one_more))
         return index * self.each + more
+
+
+def sample_count(settings: Settings, spp: int, sensor) -> int:
+    """Samples per pixel to be shared: ``spp``, or, if that is 0, those of the sensor's sampler, but
+    no fewer than _SEVERAL where passes go on until something ends them."""
+    if spp:
+        return spp
+    count = sensor.sampler().sample_count()
+    return count if settings.passes else max(count, _SEVERAL)
 
 
 def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Shares:

@@ -17,6 +17,7 @@ from ..lobe_path import GlossyVertex, follow, no_lobe
 from ..map.receivers import gathered_part, read_receiver
 from ..map.spectra import channel_mean
 from . import layers
+from .direct_light import DirectLight
 from .lamps import Lamps
 from .rays import reach_of, spawn_ray
 from .survey_parts import Apart
@@ -44,6 +45,7 @@ class WalkOptions:
     light          split light by how it came (see ``layers``).
     surface        keep what is seen.
     lamps          where emitters are; None: anywhere.
+    direct         how emitters are drawn; None: as Mitsuba does.
     """
 
     use: Use
@@ -61,6 +63,7 @@ class WalkOptions:
     light: bool = False
     surface: bool = False
     lamps: Lamps | None = None
+    direct: DirectLight | None = None
 
 
 class Vertex(NamedTuple):
@@ -115,6 +118,7 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
     valid = mi.Bool(not o.hide_emitters and scene.environment() is not None)  # Anything seen?
     scattered = mi.Bool(False)  # Has the path left a gathered part? ("caustic", "final_gather")
     si_prev = dr.zeros(mi.Interaction3f)  # Last vertex
+    chances = o.direct.begin() if o.direct else []  # With which emitters were drawn there
     pdf_prev = mi.Float(1)  # Density of the last BSDF sample
     delta_prev = mi.Bool(True)  # Was it a delta distribution (or the camera)?
     path = first_lobe(o)
@@ -137,7 +141,7 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
         if dr.hint(o.hide_emitters, mode="scalar"):
             # As path does: the environment appears once a surface has been seen.
             seen &= valid | si.is_valid()
-        pdf_emitter = scene.pdf_emitter_direction(si_prev, ds, seen & ~delta_prev)
+        pdf_emitter = _light_pdf(scene, o.direct, si_prev, chances, ds, seen & ~delta_prev)
         mis = dr.select(delta_prev, 1, _power_heuristic(pdf_prev, pdf_emitter))
         emission = mis * ds.emitter.eval(si, seen)
         L[seen] = dr.fma(β_direct, emission, L)
@@ -150,7 +154,11 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
 
         # --- Direct light by emitter sampling ---
         bsdf = si.bsdf(ray)
-        ds, light, wo, f, lit = _sample_light(scene, sampler, ctx, si, bsdf, β, active)
+        if dr.hint(o.direct is not None, mode="scalar"):
+            through = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+            n = dr.mulsign(mi.Vector3f(si.n), -dr.dot(ray.d, si.n))
+            chances = o.direct.chances(si, n, through)
+        ds, light, wo, f, lit = _sample_light(scene, o, sampler, ctx, si, bsdf, β, chances, active)
         if dr.hint(o.use not in ("global", "none") and o.deep, mode="scalar"):
             # Over a walked part to a gathered one: the map has it.
             whole = f
@@ -218,16 +226,29 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
     return (apart.parts(L) if apart is not None else kept), valid
 
 
-def _sample_light(scene, sampler, ctx, si, bsdf, β, active):
+def _sample_light(scene, o, sampler, ctx, si, bsdf, β, chances, active):
     """One emitter, with the BSDF towards it: (its sample, β times what arrives from it, weighted
     against BSDF sampling, local direction, BSDF's value with the cosine, lanes with such light)."""
     lit = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    ds, light = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
+    if o.direct is None:
+        ds, light = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
+    else:
+        ds, light = o.direct.sample(si, chances, sampler.next_2d(), lit)
     lit &= ds.pdf != 0
     wo = si.to_local(ds.d)
     f, pdf = bsdf.eval_pdf(ctx, si, wo, lit)
+    if o.direct is not None:
+        lit &= (dr.max(f) != 0) & (dr.max(light) != 0)
+        lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), lit)
     light *= β * dr.select(ds.delta, 1, _power_heuristic(ds.pdf, pdf))
     return ds, light, wo, f, lit
+
+
+def _light_pdf(scene, direct, si, chances, ds, active):
+    """Density with which ``_sample_light`` would have drawn what was met."""
+    if direct is None:
+        return scene.pdf_emitter_direction(si, ds, active)
+    return direct.pdf(si, chances, ds, active)
 
 
 def _gathered_share(o, ctx, bsdf, si, bs, is_receiver, lambertian, delta):

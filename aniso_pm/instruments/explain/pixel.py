@@ -17,7 +17,7 @@ from ...rendering import film, footprint, gathering
 from ...rendering.needs import describe, surfaces
 from ...rendering.pilot import settle
 from ...rendering.prepared import EYE, PROBE, Prepared, prepare, stream_seed
-from ...rendering.schedule import bandwidth, shares, wavelength_sample
+from ...rendering.schedule import bandwidth, sample_count, shares, wavelength_sample
 from ...rendering.settings import Settings
 from .explanation import Explanation
 from .record import Kernel, Lobe, Photons, Vertex
@@ -67,7 +67,7 @@ def explain(
 
     # --- The photon map of that pass ---
     prepared = prepare(scene, settings, hide_emitters)
-    spp = sensor.sampler().sample_count()
+    spp = sample_count(settings, 0, sensor)
     pixels = film.pixel_count(sensor.film())
     each = shares(settings, spp, pixels).each
     settled = settle(prepared, sensor, seed, each)

@@ -1,0 +1,245 @@
+"""Which emitter eye paths ask for direct light: one that may give much at the place.
+
+Mitsuba asks all alike. Here group k of the emitters is drawn at x with the chance
+
+    p_k = (1 − F) w_k/Σ w + F m_k/m,
+
+m_k of all m emitters being in it, and w_k its irradiance at x were nothing between: Φ/π cos θ
+cos θ'/d² of flat lamps of power Φ that look the same way, θ and θ' the angles at x and at the lamp,
+Φ/Ω cos θ/d² of what shines into a solid angle Ω. The angles are the best that a sphere around the
+group allows, d is never less than its radius, and light from far away is as bright everywhere
+[after the importance of Conty Estévez and Kulla 2018, without their tree]. A group is a single
+emitter as long as there are few, and neighbours have the same chance. What stands between x and a
+lamp is not known: F keeps all of them in play.
+
+Where ``sampling_weight`` says how often emitters are to be asked, they are asked as ``path`` does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import own
+from .emission import Emission, only_photons_see
+
+# Share of the samples that emitters get alike.
+_EVEN = 0.15
+# Groups at most, and those of lights that are far away.
+_MOST, _FAR = 12, 4
+# Smallest radius of a group, as a share of the scene's.
+_SMALLEST = 1e-4
+# From here on directions are alike, or have one in common.
+_ALIKE, _COMMON = 1 - 1e-4, 0.1
+
+
+@dataclass  # not frozen: Dr.Jit writes back whatever a loop mentions
+class Group:
+    """Emitters that are drawn together. Arrays with one entry, or None.
+
+    first, count  of them in ``DirectLight.members``.
+    power   w at a distance of one unit in the middle of the lobe; of far ones anywhere.
+    centre, radius  of a sphere around them; None: they are far away.
+    axis    of the lobe; None: they shine anywhere.
+    cosine  of the angle around the axis that the lobe fills; None: brightness goes with the cosine.
+    """
+
+    first: int
+    count: int
+    power: Any
+    centre: Any = None
+    radius: Any = None
+    axis: Any = None
+    cosine: Any = None
+
+    def irradiance(self, p, n, through):
+        """w at points p. n: normal on the side of the viewer; through: what comes from the other
+        side counts as well."""
+        if self.centre is None:
+            if self.axis is None:
+                return self.power
+            to, near, size = -self.axis, mi.Float(1), mi.Float(0)
+        else:
+            to = self.centre - p
+            near = dr.rsqrt(dr.maximum(dr.squared_norm(to), dr.square(self.radius)))
+            to, size = to * near, self.radius * near
+        w = self.power * dr.square(near)
+        w *= dr.select(through, 1, dr.clip(dr.dot(n, to) + size, 0, 1))
+        if self.axis is None or self.centre is None:
+            return w
+        there = -dr.dot(self.axis, to)
+        if self.cosine is not None:
+            return dr.select(there + size >= self.cosine, w, 0)
+        return w * dr.select(there > 0, dr.minimum(there + 0.5 * size, 1), 0)
+
+
+@dataclass  # not frozen, as above
+class DirectLight:
+    """The emitters of a scene.
+
+    groups    of them.
+    members   their numbers, group by group.
+    group_of  of an emitter, by its registry number; alone: 1/count of that group.
+    emitters  mi.EmitterPtr, by number.
+    """
+
+    groups: list[Group]
+    members: Any
+    group_of: Any
+    alone: Any
+    emitters: Any
+
+    @staticmethod
+    def of(scene, emission: Emission | None) -> DirectLight | None:
+        """None where there is nothing to choose, or somebody has chosen."""
+        emitters = scene.emitters()
+        weights = {e.sampling_weight() for e in emitters}
+        if emission is None or len(weights) != 1 or 0 in weights:
+            return None
+        asked = [k for k, e in enumerate(emitters) if not only_photons_see(e)]
+        if len(asked) < 2:
+            return None
+        extent = float(scene.bbox().bounding_sphere().radius)
+        groups: list[Group] = []
+        members: list[int] = []
+        for numbers in _neighbours(emitters, asked):
+            power = sum(emission.share[k] for k in numbers)
+            some = [emitters[k] for k in numbers]
+            groups.append(_group(some, power, extent, len(members)))
+            members += numbers
+        # As the registry counts them; others are never met.
+        ids = dr.reinterpret_array(mi.UInt32, scene.emitters_dr()).numpy()
+        group_of, alone = np.zeros(ids.max() + 1, np.uint32), np.zeros(ids.max() + 1, np.float32)
+        for k, group in enumerate(groups):
+            inside = ids[members[group.first : group.first + group.count]]
+            group_of[inside], alone[inside] = k, 1 / group.count
+        return DirectLight(
+            groups,
+            own(mi.UInt32, np.array(members, np.uint32)),
+            own(mi.UInt32, group_of),
+            own(mi.Float, alone),
+            scene.emitters_dr(),
+        )
+
+    def begin(self) -> list:
+        """Chances before anything was drawn."""
+        return [mi.Float(0) for _ in self.groups]
+
+    def chances(self, si, n, through) -> list:
+        """p of each group. n, through: as for ``Group.irradiance``."""
+        w = [group.irradiance(si.p, n, through) for group in self.groups]
+        scale = (1 - _EVEN) / dr.maximum(sum(w), 1e-30)
+        lit = sum(w) > 1e-30
+        all_ = sum(group.count for group in self.groups)
+        even = [group.count / all_ for group in self.groups]
+        return [
+            dr.select(lit, dr.fma(scale, w, _EVEN * e), e) for w, e in zip(w, even, strict=True)
+        ]
+
+    def sample(self, si, chances, u, active):
+        """(direction sample, radiance over its density) as ``mi.Scene.sample_emitter_direction``
+        has them, not tested for visibility."""
+        first, count = mi.UInt32(0), mi.UInt32(1)
+        below, chance, sum_ = mi.Float(0), mi.Float(1), mi.Float(0)
+        for group, p in zip(self.groups, chances, strict=True):
+            here = (u.x >= sum_) & (p > 0)
+            first, count = dr.select(here, group.first, first), dr.select(here, group.count, count)
+            below, chance = dr.select(here, sum_, below), dr.select(here, p, chance)
+            sum_ += p
+        x = dr.clip((u.x - below) / chance, 0, dr.one_minus_epsilon(mi.Float)) * mi.Float(count)
+        member = dr.minimum(mi.UInt32(x), count - 1)
+        index = dr.gather(mi.UInt32, self.members, first + member, active)
+        emitter = dr.gather(mi.EmitterPtr, self.emitters, index, active)
+        ds, light = emitter.sample_direction(si, mi.Point2f(x - mi.Float(member), u.y), active)
+        chance /= mi.Float(count)
+        ds.pdf *= chance
+        return ds, light / chance
+
+    def pdf(self, si, chances, ds, active):
+        """Of a direction in which an emitter was met, as ``mi.Scene.pdf_emitter_direction``."""
+        number = dr.reinterpret_array(mi.UInt32, ds.emitter)
+        group = dr.gather(mi.UInt32, self.group_of, number, active)
+        chance = mi.Float(0)
+        for k, p in enumerate(chances):
+            chance = dr.select(group == k, p, chance)
+        chance *= dr.gather(mi.Float, self.alone, number, active)
+        return ds.emitter.pdf_direction(si, ds, active) * chance
+
+
+def _neighbours(emitters, asked) -> list[list[int]]:
+    """The numbers of emitters that are drawn together."""
+    near = [k for k in asked if emitters[k].bbox().valid()]
+    far = [[k] for k in asked if k not in near]
+    if len(far) > _FAR:
+        far = [[k for group in far for k in group]]
+    middle = {k: np.array(emitters[k].bbox().center()) for k in near}
+    groups = [near] if near else []
+    while 0 < len(groups) < min(_MOST - len(far), len(near)):
+        spreads = [np.ptp([middle[k] for k in group], axis=0) for group in groups]
+        # Those of one place are cut as well.
+        sizes = [s.max() if len(g) > 1 else -1 for s, g in zip(spreads, groups, strict=True)]
+        at = int(np.argmax(sizes))
+        axis = spreads[at].argmax()
+        order = sorted(groups.pop(at), key=lambda k: (middle[k][axis], k))
+        groups += [order[: len(order) // 2], order[len(order) // 2 :]]
+    return groups + far
+
+
+def _group(emitters, power: float, extent: float, first: int) -> Group:
+    """extent: radius of the scene, in units of which w counts distances. power: on any scale."""
+    axis, cosine = _lobe(emitters)
+    boxes = [e.bbox() for e in emitters]
+    near = all(box.valid() for box in boxes)
+    centre = radius = None
+    if near:
+        low, high = np.min([box.min for box in boxes], 0), np.max([box.max for box in boxes], 0)
+        centre = mi.Point3f(*_constants(0.5 * (low + high)))
+        radius = _constant(max(0.5 * np.linalg.norm(high - low), _SMALLEST * extent))
+        power *= extent**2 / (np.pi if cosine is None else 2 * np.pi * (1 - cosine))
+    else:
+        power /= np.pi * (4 if axis is None else 1)
+    return Group(
+        first,
+        len(emitters),
+        _constant(power),
+        centre,
+        radius,
+        None if axis is None else mi.Vector3f(*_constants(axis)),
+        None if cosine is None or axis is None else _constant(cosine),
+    )
+
+
+def _lobe(emitters) -> tuple[np.ndarray | None, float | None]:
+    """(axis, cosine) as ``Group`` has them; cosine −1 where there is no axis."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 256)
+    time, u1, u2, u3 = mi.Float(0), sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+    shapes = [e.get_shape() for e in emitters]
+    directions = []
+    for emitter, shape in zip(emitters, shapes, strict=True):
+        if emitter.is_environment():
+            return None, -1.0
+        if shape is not None:
+            directions.append(np.array(shape.sample_position(time, u2).n).T)
+        else:
+            directions.append(np.array(emitter.sample_ray(time, u1, u2, u3)[0].d).T)
+    d = np.concatenate(directions)
+    mean = d.mean(0)
+    length = float(np.linalg.norm(mean))
+    if None not in shapes:
+        return (mean / length, None) if length > _ALIKE else (None, -1.0)
+    if length < _COMMON or len(emitters) > 1:
+        return None, -1.0
+    return mean / length, min(float((d @ mean).min()) / length, _ALIKE)
+
+
+def _constant(value):
+    return own(mi.Float, np.array([value], np.float32))
+
+
+def _constants(values):
+    return [_constant(value) for value in values]
