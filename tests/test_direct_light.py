@@ -96,8 +96,11 @@ def test_chances_are_those_of_the_samples():
 @pytest.mark.parametrize("through", [False, True])
 def test_densities_are_those_of_the_samples(through):
     """What a ray meets has the density with which it would have been drawn."""
-    scene = scene_of({k: v for k, v in emitters().items() if k not in ("point", "spot", "sun")})
+    lamps = {k: v for k, v in emitters().items() if k not in ("point", "spot", "sun")}
+    many = {f"lamp_{k}": square(0.08 * k - 0.8, -0.5, 0.6, 0.02, 50.0) for k in range(20)}
+    scene = scene_of(lamps | many)
     direct = prepared(scene)
+    assert max(group.count for group in direct.groups) > 1
     si, n, through = places(scene, 50_000, through)
     chances = direct.chances(si, n, through)
     ds, light = direct.sample(si, chances, uniform(50_000), True)
@@ -240,3 +243,24 @@ def test_many_lamps_cost_less_noise_than_in_path(variants_all, monkeypatch, map_
         noise[name] = (images.var(0, ddof=1) / (images.mean(0) ** 2 + 1e-3)).mean()
     assert means["ours"] == pytest.approx(means["path"], rel=0.02)
     assert noise["ours"] < 0.5 * noise["path"]
+
+
+def test_light_that_both_ways_find_counts_once(monkeypatch):
+    """Large lamps near rough metal, met by BSDF sampling as often as they are asked."""
+    leave_out_the_pilot(monkeypatch)
+    lamps = {"left": square(-0.7, 0, -0.4, 0.6, 1.0, 150), "right": square(0.9, 0, -0.3, 0.4, 3.0)}
+    metal = {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.15}}
+    floor = {"type": "rectangle", "bsdf": metal}
+    floor["to_world"] = mi.ScalarTransform4f().translate([0, 0, -0.99])
+    sensor = {
+        "type": "perspective",
+        "to_world": mi.ScalarTransform4f().look_at([0, -2, 0.5], [0, 0, -1], [0, 0, 1]),
+        "film": {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}},
+        "sampler": {"type": "owen_sobol", "sample_count": 16},
+    }
+    scene = scene_of(lamps, metal=floor, sensor=sensor)
+    means = {}
+    for name in ("aniso_pm", "path"):
+        integrator = mi.load_dict({"type": name})
+        means[name] = np.array(mi.render(scene, integrator=integrator, spp=1024, seed=1)).mean()
+    assert means["aniso_pm"] == pytest.approx(means["path"], rel=0.003)

@@ -99,11 +99,11 @@ def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
         ),
         _direct_light(scene),
         Finding(
-            "paths towards lamps only",
-            scene.lamps is not None,
-            "eye paths that can only end at an emitter go on towards boxes around these"
-            if scene.lamps
-            else "light may come from anywhere",
+            "rays that meet no lamp",
+            not scene.needs_map or scene.towards_lamps is None,
+            "where an eye path can only end at an emitter, traced towards boxes around these"
+            if scene.towards_lamps
+            else "traced in any direction",
             [],
         ),
         _environment(scene),

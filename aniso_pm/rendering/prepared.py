@@ -91,6 +91,11 @@ class Prepared(Decisions):
         """Is it frozen?"""
         return self.launch != Launch()
 
+    @property
+    def towards_lamps(self) -> Lamps | None:
+        """Where paths go on that gather all but emission. With other uses they go on anyway."""
+        return self.lamps if self.use in ("global", "final_gather") else None
+
     def thawed(self) -> Prepared:
         """The same scene with nothing frozen."""
         return replace(self, launch=Launch())
@@ -173,8 +178,7 @@ class Prepared(Decisions):
             thinning=thinning,
             light=for_layers and self.light_layers,
             surface=for_layers and self.surface_layers,
-            # With the other uses paths go on in any case.
-            lamps=self.lamps if self.use in ("global", "final_gather") else None,
+            lamps=self.towards_lamps,
             direct=self.direct,
         )
         launch = self.launch.eye
