@@ -80,7 +80,7 @@ def test_chances_are_those_of_the_samples():
     chances = direct.chances(si, n, through)
     p = np.array([c.numpy()[0] for c in chances])
     np.testing.assert_allclose(p.sum(), 1, rtol=1e-5)
-    assert (p > 0.9 * direct_light._EVEN / 7).all()
+    assert (p > 0.9 * direct_light._BY_WEIGHT / 7).all()
     wide = [dr.repeat(c, count) for c in chances]
     ds, _ = direct.sample(
         dr.gather(type(si), si, dr.zeros(mi.UInt32, count)), wide, uniform(count), True
@@ -112,9 +112,15 @@ def test_densities_are_those_of_the_samples(through):
     )
 
 
-def test_the_light_is_that_of_mitsuba():
-    """Means over many samples, of one emitter after the other and of all."""
-    scene = scene_of(emitters())
+@pytest.mark.parametrize("weights", [{}, {"flat": 5.0, "point": 0.0, "tilted": 0.0, "sky": 0.1}])
+def test_the_light_is_that_of_mitsuba(weights):
+    """Means over many samples, of one emitter after the other; those of weight 0 are not asked."""
+    lamps = emitters()
+    for name, weight in weights.items():
+        given = {"sampling_weight": weight}
+        lamp = lamps[name]
+        lamps[name] = lamp | ({"emitter": lamp["emitter"] | given} if "emitter" in lamp else given)
+    scene = scene_of(lamps)
     direct = prepared(scene)
     count = 1 << 20
     si, n, through = places(scene, count)
@@ -144,7 +150,7 @@ def test_what_cannot_light_a_place_is_hardly_asked():
             for g, c in zip(direct.groups, p, strict=True)
         }
 
-    even = direct_light._EVEN / 3
+    even = direct_light._BY_WEIGHT / 3
     p = chances(False)
     assert p["above"] == pytest.approx(1 - 2 * even, rel=1e-4)
     assert p["below"] == p["away"] == pytest.approx(even, rel=1e-4)
@@ -165,13 +171,23 @@ def test_near_lamps_are_asked_most():
     assert max(p) > 0.6
 
 
-def test_nothing_is_chosen_where_somebody_has_or_nobody_can():
+def test_nothing_is_chosen_where_there_is_one_emitter():
     lamps = {k: emitters()[k] for k in ("point", "sky")}
     assert prepared(scene_of(lamps)) is not None
-    weighted = {**lamps, "point": lamps["point"] | {"sampling_weight": 3.0}}
-    assert prepared(scene_of(weighted)) is None
+    dark = {**lamps, "point": lamps["point"] | {"sampling_weight": 0.0}}
+    assert prepared(scene_of(dark)) is None
     assert prepared(scene_of({"sky": lamps["sky"]})) is None
     assert DirectLight.of(scene_of({}), None) is None
+
+
+def test_weights_share_what_no_estimate_does():
+    lamps = {"left": square(-0.5, 0, 0.9, 0.1, 1.0), "right": square(0.5, 0, 0.9, 0.1, 1.0)}
+    lamps["right"]["emitter"]["sampling_weight"] = 3.0
+    direct = prepared(scene_of(lamps))
+    p = direct.chances(dr.zeros(mi.SurfaceInteraction3f), mi.Vector3f(0, 0, 1), mi.Bool(False))
+    half, by_weight = 0.5 * (1 - direct_light._BY_WEIGHT), direct_light._BY_WEIGHT
+    expected = [half + 0.25 * by_weight, half + 0.75 * by_weight]
+    assert sorted(c.numpy()[0] for c in p) == pytest.approx(expected, rel=1e-3)
 
 
 def test_inspect_says_which_emitters_are_asked():
@@ -184,8 +200,6 @@ def test_inspect_says_which_emitters_are_asked():
     assert chosen.needed and chosen.evidence == ["2 emitters in 2 groups"]
     alone = found(scene_of({"sky": lamps["sky"]}))
     assert not alone.needed and alone.consequence == "nothing to choose"
-    weighted = scene_of({**lamps, "point": lamps["point"] | {"sampling_weight": 3.0}})
-    assert "sampling_weight" in found(weighted).consequence
 
 
 def lit_by(many, ball):

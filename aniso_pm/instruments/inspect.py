@@ -155,9 +155,7 @@ def _direct_light(scene: Prepared) -> Finding:
         groups = f"{len(emitters)} emitters in {len(direct.groups)} groups"
         why = "emitters are asked by what they may give at the place"
         return Finding(name, True, why, [groups])
-    weights = {e.sampling_weight() for e in emitters}
-    why = "nothing to choose" if len(weights) < 2 else "emitters are asked by their sampling_weight"
-    return Finding(name, False, why, [])
+    return Finding(name, False, "nothing to choose", [])
 
 
 def _focus(scene: Prepared) -> Finding:

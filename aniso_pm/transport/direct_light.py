@@ -2,17 +2,16 @@
 
 Mitsuba asks all alike. Here group k of the emitters is drawn at x with the chance
 
-    p_k = (1 − F) w_k/Σ w + F m_k/m,
+    p_k = (1 − F) w_k/Σ w + F s_k/Σ s,
 
-m_k of all m emitters being in it, and w_k its irradiance at x were nothing between: Φ/π cos θ
-cos θ'/d² of flat lamps of power Φ that look the same way, θ and θ' the angles at x and at the lamp,
-Φ/Ω cos θ/d² of what shines into a solid angle Ω. The angles are the best that a sphere around the
-group allows, d is never less than its radius, and light from far away is as bright everywhere
-[after the importance of Conty Estévez and Kulla 2018, without their tree]. A group is a single
-emitter as long as there are few, and neighbours have the same chance. What stands between x and a
-lamp is not known: F keeps all of them in play.
-
-Where ``sampling_weight`` says how often emitters are to be asked, they are asked as ``path`` does.
+s_k being the ``sampling_weight`` of its emitters together, and w_k its irradiance at x were nothing
+between: Φ/π cos θ cos θ'/d² of flat lamps of power Φ that look the same way, θ and θ' the angles at
+x and at the lamp, Φ/Ω cos θ/d² of what shines into a solid angle Ω. The angles are the best that a
+sphere around the group allows, d is never less than its radius, and light from far away is as
+bright everywhere [after the importance of Conty Estévez and Kulla 2018, without their tree]. A
+group is a single emitter as long as there are few; neighbours in a group have the same chance. What
+stands between x and a lamp is not known: F keeps all of them in play. Emitters of weight 0 are
+never asked, as in ``path``.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ import numpy as np
 from ..arrays import own
 from .emission import Emission, only_photons_see
 
-# Share of the samples that emitters get alike.
-_EVEN = 0.15
+# F, the share of the samples that goes by weights.
+_BY_WEIGHT = 0.15
 # Groups at most, and those of lights that are far away.
 _MOST, _FAR = 12, 4
 # Smallest radius of a group, as a share of the scene's.
@@ -42,6 +41,7 @@ class Group:
     """Emitters that are drawn together. Arrays with one entry, or None.
 
     first, count  of them in ``DirectLight.members``.
+    weight  their part of all weights.
     power   w at a distance of one unit in the middle of the lobe; of far ones anywhere.
     centre, radius  of a sphere around them; None: they are far away.
     axis    of the lobe; None: they shine anywhere.
@@ -50,6 +50,7 @@ class Group:
 
     first: int
     count: int
+    weight: Any
     power: Any
     centre: Any = None
     radius: Any = None
@@ -95,21 +96,21 @@ class DirectLight:
 
     @staticmethod
     def of(scene, emission: Emission | None) -> DirectLight | None:
-        """None where there is nothing to choose, or somebody has chosen."""
+        """None where there is nothing to choose."""
         emitters = scene.emitters()
-        weights = {e.sampling_weight() for e in emitters}
-        if emission is None or len(weights) != 1 or 0 in weights:
+        weight = [e.sampling_weight() for e in emitters]
+        asked = [k for k, e in enumerate(emitters) if weight[k] > 0 and not only_photons_see(e)]
+        if emission is None or len(asked) < 2:
             return None
-        asked = [k for k, e in enumerate(emitters) if not only_photons_see(e)]
-        if len(asked) < 2:
-            return None
+        all_ = sum(weight[k] for k in asked)
         extent = float(scene.bbox().bounding_sphere().radius)
         groups: list[Group] = []
         members: list[int] = []
         for numbers in _neighbours(emitters, asked):
-            power = sum(emission.share[k] for k in numbers)
+            power = sum(emission.share[k] / weight[k] for k in numbers)
             some = [emitters[k] for k in numbers]
-            groups.append(_group(some, power, extent, len(members)))
+            part = sum(weight[k] for k in numbers) / all_
+            groups.append(_group(some, len(members), part, power, extent))
             members += numbers
         # As the registry counts them; others are never met.
         ids = dr.reinterpret_array(mi.UInt32, scene.emitters_dr()).numpy()
@@ -132,13 +133,14 @@ class DirectLight:
     def chances(self, si, n, through) -> list:
         """p of each group. n, through: as for ``Group.irradiance``."""
         w = [group.irradiance(si.p, n, through) for group in self.groups]
-        scale = (1 - _EVEN) / dr.maximum(sum(w), 1e-30)
-        lit = sum(w) > 1e-30
-        all_ = sum(group.count for group in self.groups)
-        even = [group.count / all_ for group in self.groups]
-        return [
-            dr.select(lit, dr.fma(scale, w, _EVEN * e), e) for w, e in zip(w, even, strict=True)
-        ]
+        sum_ = sum(w)
+        lit, scale = sum_ > 1e-30, (1 - _BY_WEIGHT) / dr.maximum(sum_, 1e-30)
+        found = []
+        for group, w_k in zip(self.groups, w, strict=True):
+            found.append(
+                dr.select(lit, dr.fma(scale, w_k, _BY_WEIGHT * group.weight), group.weight)
+            )
+        return found
 
     def sample(self, si, chances, u, active):
         """(direction sample, radiance over its density) as ``mi.Scene.sample_emitter_direction``
@@ -189,7 +191,7 @@ def _neighbours(emitters, asked) -> list[list[int]]:
     return groups + far
 
 
-def _group(emitters, power: float, extent: float, first: int) -> Group:
+def _group(emitters, first: int, weight: float, power: float, extent: float) -> Group:
     """extent: radius of the scene, in units of which w counts distances. power: on any scale."""
     axis, cosine = _lobe(emitters)
     boxes = [e.bbox() for e in emitters]
@@ -205,6 +207,7 @@ def _group(emitters, power: float, extent: float, first: int) -> Group:
     return Group(
         first,
         len(emitters),
+        _constant(weight),
         _constant(power),
         centre,
         radius,
