@@ -32,6 +32,8 @@ _BY_WEIGHT = 0.15
 _MOST, _FAR = 12, 4
 # Smallest radius of a group, as a share of the scene's.
 _SMALLEST = 1e-4
+# Emitters of a group whose directions are looked at.
+_LOOKED_AT = 16
 # From here on directions are alike, or have one in common.
 _ALIKE, _COMMON = 1 - 1e-4, 0.1
 
@@ -174,8 +176,9 @@ class DirectLight:
 
 def _neighbours(emitters, asked) -> list[list[int]]:
     """The numbers of emitters that are drawn together."""
-    near = [k for k in asked if emitters[k].bbox().valid()]
-    far = [[k] for k in asked if k not in near]
+    valid = {k: emitters[k].bbox().valid() for k in asked}
+    near = [k for k in asked if valid[k]]
+    far = [[k] for k in asked if not valid[k]]
     if len(far) > _FAR:
         far = [[k for group in far for k in group]]
     middle = {k: np.array(emitters[k].bbox().center()) for k in near}
@@ -218,6 +221,8 @@ def _group(emitters, first: int, weight: float, power: float, extent: float) -> 
 
 def _lobe(emitters) -> tuple[np.ndarray | None, float | None]:
     """(axis, cosine) as ``Group`` has them; cosine −1 where there is no axis."""
+    if len(emitters) > _LOOKED_AT:
+        return None, -1.0
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 256)
     time, u1, u2, u3 = mi.Float(0), sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
