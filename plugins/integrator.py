@@ -188,10 +188,11 @@ class AnisoPhotonMapper:
        - |bool|
        - Hide directly visible emitters. (Default: |false|)
 
-    Direct light comes from emitter sampling combined with BSDF sampling; everything that reaches a
-    receiver over two path segments or more comes from the photon map. Receivers are diffuse
-    surfaces, the diffuse part of ``plastic`` and ``roughplastic``, and surfaces whose roughness is
-    at least ``gather_roughness``. Photons and eye paths walk on all others, as ``path`` does.
+    Direct light comes from emitter sampling combined with BSDF sampling; of several emitters those
+    are asked most that may give most at the place. Everything that reaches a receiver over two path
+    segments or more comes from the photon map. Receivers are diffuse surfaces, the diffuse part of
+    ``plastic`` and ``roughplastic``, and surfaces whose roughness is at least
+    ``gather_roughness``. Photons and eye paths walk on all others, as ``path`` does.
 
     After ``render()`` the attribute ``statistics`` holds counts and timings, and ``layers`` the
     layers that were asked for, NumPy arrays (height × width × 1 or 3 channels) by name. After two
