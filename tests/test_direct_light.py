@@ -171,6 +171,19 @@ def test_near_lamps_are_asked_most():
     assert max(p) > 0.6
 
 
+def test_a_strong_lamp_among_many_is_a_group_of_its_own():
+    lamps = {f"lamp_{k}": square(0.05 * k - 0.8, 0, 0.9, 0.02, 1.0) for k in range(40)}
+    lamps["lamp_17"] = square(0.05 * 17 - 0.8, 0, 0.9, 0.02, 500.0)
+    scene = scene_of(lamps)
+    direct = prepared(scene)
+    assert len(direct.groups) <= 12
+    assert sorted(direct.members.numpy()) == list(range(40))
+    ids = [e.get_shape().id() for e in scene.emitters()]
+    members = [ids[k] for k in direct.members.numpy()]
+    group = next(g for g in direct.groups if members[g.first] == "lamp_17")
+    assert group.count == 1
+
+
 def test_nothing_is_chosen_where_there_is_one_emitter():
     lamps = {k: emitters()[k] for k in ("point", "sky")}
     assert prepared(scene_of(lamps)) is not None

@@ -9,9 +9,9 @@ between: Φ/π cos θ cos θ'/d² of flat lamps of power Φ that look the same w
 x and at the lamp, Φ/Ω cos θ/d² of what shines into a solid angle Ω. The angles are the best that a
 sphere around the group allows, d is never less than its radius, and light from far away is as
 bright everywhere [after the importance of Conty Estévez and Kulla 2018, without their tree]. A
-group is a single emitter as long as there are few; neighbours in a group have the same chance. What
-stands between x and a lamp is not known: F keeps all of them in play. Emitters of weight 0 are
-never asked, as in ``path``.
+group is a single emitter as long as there are few, or as it is strong; neighbours in a group have
+the same chance. What stands between x and a lamp is not known: F keeps all of them in play.
+Emitters of weight 0 are never asked, as in ``path``.
 """
 
 from __future__ import annotations
@@ -108,8 +108,9 @@ class DirectLight:
         extent = float(scene.bbox().bounding_sphere().radius)
         groups: list[Group] = []
         members: list[int] = []
-        for numbers in _neighbours(emitters, asked):
-            power = sum(emission.share[k] / weight[k] for k in numbers)
+        power_of = {k: emission.share[k] / weight[k] for k in asked}
+        for numbers in _together(emitters, power_of):
+            power = sum(power_of[k] for k in numbers)
             some = [emitters[k] for k in numbers]
             part = sum(weight[k] for k in numbers) / all_
             groups.append(_group(some, len(members), part, power, extent))
@@ -174,16 +175,20 @@ class DirectLight:
         return ds.emitter.pdf_direction(si, ds, active) * chance
 
 
-def _neighbours(emitters, asked) -> list[list[int]]:
-    """The numbers of emitters that are drawn together."""
-    valid = {k: emitters[k].bbox().valid() for k in asked}
-    near = [k for k in asked if valid[k]]
-    far = [[k] for k in asked if not valid[k]]
+def _together(emitters, power: dict[int, float]) -> list[list[int]]:
+    """Numbers of emitters that are drawn together: neighbours, but for those that have more than
+    their part of all the power. power: of each that is asked."""
+    valid = {k: emitters[k].bbox().valid() for k in power}
+    far = [[k] for k in power if not valid[k]]
     if len(far) > _FAR:
         far = [[k for group in far for k in group]]
+    strong = {k for k in power if valid[k] and power[k] * _MOST > sum(power.values())}
+    alone = [[k] for k in sorted(strong, key=lambda k: -power[k])[: _MOST // 2]]
+    apart = {group[0] for group in alone}
+    near = [k for k in power if valid[k] and k not in apart]
     middle = {k: np.array(emitters[k].bbox().center()) for k in near}
     groups = [near] if near else []
-    while 0 < len(groups) < min(_MOST - len(far), len(near)):
+    while 0 < len(groups) < min(_MOST - len(far) - len(alone), len(near)):
         spreads = [np.ptp([middle[k] for k in group], axis=0) for group in groups]
         # Those of one place are cut as well.
         sizes = [s.max() if len(g) > 1 else -1 for s, g in zip(spreads, groups, strict=True)]
@@ -191,7 +196,7 @@ def _neighbours(emitters, asked) -> list[list[int]]:
         axis = spreads[at].argmax()
         order = sorted(groups.pop(at), key=lambda k: (middle[k][axis], k))
         groups += [order[: len(order) // 2], order[len(order) // 2 :]]
-    return groups + far
+    return alone + groups + far
 
 
 def _group(emitters, first: int, weight: float, power: float, extent: float) -> Group:

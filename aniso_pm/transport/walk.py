@@ -1,8 +1,9 @@
 """The walk of an eye path from vertex to vertex.
 
 A path is traced as Mitsuba's ``path`` does (emitter sampling and BSDF sampling, combined by the
-power heuristic), but that emitters are drawn by what they may give (see ``direct_light``). What it leaves to the photon map at a receiver, and where it goes on, depends on
-how the map is used (see ``uses``).
+power heuristic), but that emitters are drawn by what they may give (see ``direct_light``). What it
+leaves to the photon map at a receiver, and where it goes on, depends on how the map is used (see
+``uses``).
 """
 
 from __future__ import annotations
