@@ -1,6 +1,7 @@
 """Passes: pure, summed with their variance, as many as one likes."""
 
 import math
+import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -249,6 +250,27 @@ def test_interruption_between_photons_and_eye_paths_leaves_whole_passes():
     assert plugin.statistics["interrupted"] and plugin.statistics["passes"] == 2
     close(image, render(scene, integrator(passes=2), 4))
     assert plugin.variance.shape == image.shape
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_ctrl_c_that_python_loses_ends_rendering_after_the_pass():
+    """Where a finaliser runs, KeyboardInterrupt is printed, and the program goes on."""
+
+    class Dying:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    plugin = integrator(passes=6)
+
+    def last_breath(index, image, statistics):
+        if index == 1:
+            Dying()
+
+    plugin.callback = last_breath
+    before = signal.getsignal(signal.SIGINT)
+    render(load(), plugin, 12)
+    assert plugin.statistics["interrupted"] and plugin.statistics["passes"] == 2
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 # --- Long runs ---

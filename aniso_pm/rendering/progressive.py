@@ -24,6 +24,7 @@ from .accumulate import mean_and_variance, relative_standard_error
 from .beginning import Decided, decide
 from .controls import Controls, Rendered
 from .done import Batch, Done
+from .interrupts import Interrupts
 from .one_pass import Tracer
 from .prepared import Prepared
 from .schedule import bandwidth
@@ -45,13 +46,16 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
     """
     run = Run(scene, sensor, seed, spp, controls, statistics)
     try:
-        run.start()
-        if controls.elsewhere:
-            for batch in controls.elsewhere(run):
-                run.add(batch)
-        else:
-            for index in run.numbers():
-                run.render_pass(index)
+        with Interrupts() as interrupts:
+            run.start()
+            if controls.elsewhere:
+                for batch in controls.elsewhere(run):
+                    run.add(batch)
+                    interrupts.check()
+            else:
+                for index in run.numbers():
+                    run.render_pass(index)
+                    interrupts.check()
     except BaseException as error:
         failed = isinstance(error, Failed)
         if not (failed or is_interrupt(error)) or not run.keep_unfinished():
