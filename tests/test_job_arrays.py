@@ -45,7 +45,7 @@ cd / && HOST=$host bash -c "$*"
 """
 # In place of the program: what it was called with.
 RECORDS = """#!/bin/bash
-for word in "$@"; do printf '<%s>' "$word"; done >> "$RECORD"; echo " $HOST" >> "$RECORD"
+line=$(printf '<%s>' "$@"); echo "$line $HOST" >> "$RECORD"  # at once: hosts write together
 """
 
 
