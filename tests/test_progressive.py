@@ -273,6 +273,18 @@ def test_ctrl_c_that_python_loses_ends_rendering_after_the_pass():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_open_passes_are_not_as_small_as_a_sampler_has_them_by_itself():
+    scene = load()
+    sensor = scene.sensors()[0]
+    sensor.sampler().set_sample_count(4)
+    endless, fixed = Settings(passes=0, time=1.0), Settings(passes=2)
+    assert schedule.sample_count(endless, 0, sensor) == 8
+    assert schedule.sample_count(endless, 4, sensor) == 4
+    assert schedule.sample_count(fixed, 0, sensor) == 4
+    sensor.sampler().set_sample_count(32)
+    assert schedule.sample_count(endless, 0, sensor) == 32
+
+
 # --- Long runs ---
 
 

@@ -23,8 +23,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import own
+from ..arrays import number, own
 from .emission import Emission, only_photons_see
+from .lamps import neighbours
 
 # F, the share of the samples that goes by weights.
 _BY_WEIGHT = 0.15
@@ -186,17 +187,9 @@ def _together(emitters, power: dict[int, float]) -> list[list[int]]:
     alone = [[k] for k in sorted(strong, key=lambda k: -power[k])[: _MOST // 2]]
     apart = {group[0] for group in alone}
     near = [k for k in power if valid[k] and k not in apart]
-    middle = {k: np.array(emitters[k].bbox().center()) for k in near}
-    groups = [near] if near else []
-    while 0 < len(groups) < min(_MOST - len(far) - len(alone), len(near)):
-        spreads = [np.ptp([middle[k] for k in group], axis=0) for group in groups]
-        # Those of one place are cut as well.
-        sizes = [s.max() if len(g) > 1 else -1 for s, g in zip(spreads, groups, strict=True)]
-        at = int(np.argmax(sizes))
-        axis = spreads[at].argmax()
-        order = sorted(groups.pop(at), key=lambda k: (middle[k][axis], k))
-        groups += [order[: len(order) // 2], order[len(order) // 2 :]]
-    return alone + groups + far
+    middles = np.array([emitters[k].bbox().center() for k in near]).reshape(-1, 3)
+    groups = neighbours(middles, _MOST - len(far) - len(alone))
+    return alone + [[near[k] for k in group] for group in groups] + far
 
 
 def _group(emitters, first: int, weight: float, power: float, extent: float) -> Group:
@@ -207,20 +200,23 @@ def _group(emitters, first: int, weight: float, power: float, extent: float) -> 
     centre = radius = None
     if near:
         low, high = np.min([box.min for box in boxes], 0), np.max([box.max for box in boxes], 0)
-        centre = mi.Point3f(*_constants(0.5 * (low + high)))
-        radius = _constant(max(0.5 * np.linalg.norm(high - low), _SMALLEST * extent))
+        centre = mi.Point3f(*(0.5 * (low + high)).tolist())
+        size = 0.5 * float(np.linalg.norm(high - low))
+        radius = number(mi.Float, max(size, _SMALLEST * extent))
         power *= extent**2 / (np.pi if cosine is None else 2 * np.pi * (1 - cosine))
     else:
         power /= np.pi * (4 if axis is None else 1)
+    lobe = None if axis is None else mi.Vector3f(*axis.tolist())
+    dr.make_opaque(centre, lobe)
     return Group(
         first,
         len(emitters),
-        _constant(weight),
-        _constant(power),
+        number(mi.Float, weight),
+        number(mi.Float, power),
         centre,
         radius,
-        None if axis is None else mi.Vector3f(*_constants(axis)),
-        None if cosine is None or axis is None else _constant(cosine),
+        lobe,
+        None if cosine is None or axis is None else number(mi.Float, cosine),
     )
 
 
@@ -248,11 +244,3 @@ def _lobe(emitters) -> tuple[np.ndarray | None, float | None]:
     if length < _COMMON or len(emitters) > 1:
         return None, -1.0
     return mean / length, min(float((d @ mean).min()) / length, _ALIKE)
-
-
-def _constant(value):
-    return own(mi.Float, np.array([value], np.float32))
-
-
-def _constants(values):
-    return [_constant(value) for value in values]

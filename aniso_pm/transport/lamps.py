@@ -13,11 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import own
-
 # Boxes at most, each of which every such ray is tested against.
 _MOST = 8
-# By how much boxes are larger than shapes, as a share of the largest coordinate: rounding.
+# By how much boxes are larger than shapes, as a share of the scene's largest coordinate: rounding.
 _LARGER = 1e-5
 
 
@@ -35,15 +33,13 @@ class Lamps:
         if scene.environment() is not None or not all(box.valid() for box in found):
             return None
         corners = np.array([[box.min, box.max] for box in found], np.float64).reshape(-1, 2, 3)
-        groups = [corners] if len(corners) else []
-        while 0 < len(groups) < min(_MOST, len(corners)):
-            largest = max((g for g in groups if len(g) > 1), key=_spread)
-            groups = [g for g in groups if g is not largest] + _halves(largest)
+        whole = scene.bbox()
+        more = _LARGER * np.abs([whole.min, whole.max]).max() if found else 0
         boxes = []
-        for group in groups:
-            low, high = group[:, 0].min(0), group[:, 1].max(0)
-            more = _LARGER * np.abs([low, high]).max()
-            boxes.append(tuple(_point(corner) for corner in (low - more, high + more)))
+        for group in neighbours(corners.mean(1), _MOST):
+            low, high = corners[group, 0].min(0) - more, corners[group, 1].max(0) + more
+            boxes.append((mi.Point3f(*low.tolist()), mi.Point3f(*high.tolist())))
+        dr.make_opaque(boxes)
         return Lamps(tuple(boxes))
 
     def may_meet(self, ray):
@@ -57,16 +53,16 @@ class Lamps:
         return met
 
 
-def _spread(group) -> float:
-    return float(np.ptp(group.mean(1), axis=0).max())
-
-
-def _halves(group) -> list[np.ndarray]:
-    """Lamps on either side along the axis on which they lie farthest apart."""
-    middles = group.mean(1)
-    order = np.argsort(middles[:, np.ptp(middles, axis=0).argmax()], kind="stable")
-    return [group[half] for half in np.array_split(order, 2)]
-
-
-def _point(corner):
-    return mi.Point3f(*(own(mi.Float, np.array([x], np.float32)) for x in corner))
+def neighbours(points: np.ndarray, most: int) -> list[list[int]]:
+    """Numbers of the points (n, 3) in ``most`` groups, or n if these are fewer: the group that
+    reaches farthest along an axis is cut into halves, again and again."""
+    groups = [list(range(len(points)))] if len(points) else []
+    while 0 < len(groups) < min(most, len(points)):
+        reach = [np.ptp(points[group], axis=0) for group in groups]
+        # Points at one place are told apart as well.
+        sizes = [r.max() if len(g) > 1 else -1 for r, g in zip(reach, groups, strict=True)]
+        at = int(np.argmax(sizes))
+        group, axis = groups.pop(at), reach[at].argmax()
+        group.sort(key=lambda k: (points[k, axis], k))
+        groups += [group[: len(group) // 2], group[len(group) // 2 :]]
+    return groups
