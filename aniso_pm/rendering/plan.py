@@ -13,12 +13,14 @@ that errors are relative,
 A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot)
 has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths
 being what the film's filter leaves of it, that of shared photons the root of it), and costs
-n P (C + q C_g) + N C_p, P the number of pixels. For given n, variance times cost is smallest at
+n P (C + q (C_g + N C_m)) + N C_p, P the number of pixels, C_m the work of the photons of one light
+path that a gather meets. For given n, variance times cost is smallest at
 
-    q² = C (V_g + V_gp)/(V_r C_g),        N² = n² P (C + q C_g) B / (A C_p),
+    q² = C (V_g + V_gp)/(V_r (C_g + N C_m)),    N² = n² P (C + q C_g) B / (A (C_p + n P q C_m)),
 
 and with samples of a pixel in proportion to √((V_r + (V_g + V_gp)/q)/C) there, C the work of an eye
-path of that pixel. Costs are counted, not timed, so that every machine decides alike.
+path of that pixel. Costs are counted, not timed, so that every machine decides alike; those of
+gathers tile by tile: kernels are wide where there are few photons.
 
 *Widths of kernels.* All this is gathered with kernels of several widths w, in pixels. B falls as
 1/w². With D = g(8) − g(4) the product D_aA D_bB has neither the noise of eye paths nor of photons
@@ -67,16 +69,16 @@ _LATER_STRATIFIED = 0.85
 class Found:
     """What a use of the map gives to the pairs: light from map a, b through narrow kernels and
     through wide ones, what came over lobes of a, (pairs, 2); photons that an eye path meets and
-    gather points that it leaves, as many as on Lambertian receivers would be the same work; light
-    paths and photons of a map; how to aim those."""
+    gather points that it leaves (pairs), as many as on Lambertian receivers would be the same work;
+    light paths and photons of a map; how to aim those."""
 
     a: np.ndarray
     b: np.ndarray
     wide_a: np.ndarray
     wide_b: np.ndarray
     over_lobes: np.ndarray
-    met: float
-    points: float
+    met: np.ndarray
+    points: np.ndarray
     emitted: int
     stored: int
     aim: aim.Learned | None
@@ -188,9 +190,13 @@ class Plan:
         share, paths = np.ones(len(whole)), float(light_paths or 5 * found.emitted)
         widths = np.full(len(whole), NARROW if choose else 1.0)
         eye_work = float(work.mean())
-        light, met, aimed = LIGHT_PATH + LEFT * found.stored / found.emitted, found.met, 1.0
+        light, aimed = LIGHT_PATH + LEFT * found.stored / found.emitted, 1.0
+        # Were all eye paths to gather: C_g, and C_m through kernels of the first width.
+        point, photon = (smooth(tiles.grid(v)).ravel() for v in (found.points, found.met))
+        point, photon = _GATHER * point, _MET * photon / found.emitted
         if found.aim:
-            light, met, aimed = light * found.aim.work, met * found.aim.photons, found.aim.variance
+            light, photon = light * found.aim.work, photon * found.aim.photons
+            aimed = found.aim.variance
         for _ in range(_ROUNDS):
             b_1 = aimed * noise.by_photons(share * each, choose)
             if choose:
@@ -199,19 +205,19 @@ class Plan:
             else:
                 area = np.ones(len(whole))
             thinner = aimed * found.emitted / (paths * area)
-            every = _GATHER * found.points  # work, were all eye paths to gather
-            every += _MET * met * float(area.mean()) * paths / found.emitted
+            every = np.maximum(point + photon * area * paths, 1e-3)
             if v_eye > 0:
                 share = noise.share(thinner, eye_work / (v_eye * every), each)
             eye_noise = max(v_eye + float((noise.gather / share).mean()), 1e-30)
-            gather = every * float(share.mean())
             by_photons = max(0.0, float((b_1 / widths**2).mean()))
             if not light_paths:
-                costs = (eye_work + gather) / (light * tiles.pixels)
+                of_one = light + each * tiles.pixels * float((photon * area * share).mean())
+                costs = (eye_work + float((point * share).mean())) / (of_one * tiles.pixels)
                 paths = max(each * tiles.pixels * math.sqrt(by_photons * costs / eye_noise), 1.0)
 
         # --- What they promise ---
-        pass_ = each * tiles.pixels * (eye_work + gather) + paths * light
+        gather = (point + photon * area * paths) * share
+        pass_ = each * tiles.pixels * (eye_work + float(gather.mean())) + paths * light
         left = pass_ / total
         error = (eye_noise / each + by_photons / paths) * left
         blur = noise.change * (widths / NARROW) ** 3 if choose else np.zeros(len(whole))
@@ -290,8 +296,9 @@ class _Noise:
         b_1 += sizes[0] ** 2 * (often * self.narrow[0] + own * self.narrow[1])
         return 0.5 * self.emitted * b_1
 
-    def share(self, thinner, worth: float, each: int) -> np.ndarray:
-        """q of each pair. thinner: by what photons' variance is multiplied; worth: C/(V_r C_g)."""
+    def share(self, thinner, worth, each: int) -> np.ndarray:
+        """q of each pair. thinner: by what photons' variance is multiplied; worth: C over V_r and
+        the work of a gather."""
         share = np.sqrt((self.gather + self.alone * thinner) * worth)
         # Less than one in a pass: then a gather is alone with what it would share.
         more = np.sqrt((self.gather + (self.alone + self.shared) * thinner) * worth)

@@ -340,7 +340,7 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
     few = _gathered(
         *kernels[0], seed, asked, colours, lanes, maps[0], _scores(maps[0], unweighted)
     )[2]
-    most = few * _ASKED * lanes * (1 if radius else (WIDE / NARROW) ** 2)
+    most = float(few.mean()) * _ASKED * lanes * (1 if radius else (WIDE / NARROW) ** 2)
     if most > _MET_BY_ALL:
         left = int(maps[0].emitted * _MET_BY_ALL / most)
         maps = [thinned(map_, max(left, _FEWEST)) for map_ in maps]
@@ -357,7 +357,9 @@ def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points
     (a, over_lobes, met), (b, _, _) = found[0]
     (wide_a, _, _), (wide_b, _, _) = found[1]
     dearer = _dearer(points, _ASKS_GATHER)
-    met, each = dearer * met, dearer * dr.width(points.lane) / lanes
+    here = dr.zeros(mi.Float, lanes)
+    dr.scatter_add(here, mi.Float(1), points.lane)
+    met, each = dearer * met, dearer * _pairwise(here).mean(1)
     learned = _learned(maps, [column for column, _ in scores])
     emitted, stored = maps[0].emitted, maps[0].stored
     return Found(a, b, wide_a, wide_b, over_lobes, met, each, emitted, stored, learned)
@@ -418,14 +420,14 @@ def _doubt(caustic, light, weight) -> float | None:
 
 def _gathered(scene, radius, seed, points, colours, lanes, map_, scores):
     """(light of pairs, the part of it that has come over lobes, photons an eye path meets)."""
-    light, over_lobes, met = dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes), 0.0
+    light, over_lobes, met = (dr.zeros(mi.Float, lanes) for _ in range(3))
     r = dr.opaque(mi.Float, radius)
     for found in scene.gather(map_, r, seed, points, colours, scores) if map_.stored else ():
         radiance = channel_mean(found.radiance)
         dr.scatter_add(light, radiance, found.lane)
         dr.scatter_add(over_lobes, radiance, found.lane, found.follows)
-        met += float(dr.sum(mi.Float(found.photons))[0]) / lanes
-    return _pairwise(light), _pairwise(over_lobes), met
+        dr.scatter_add(met, mi.Float(found.photons), found.lane)
+    return _pairwise(light), _pairwise(over_lobes), _pairwise(met).mean(1)
 
 
 def _pairwise(values) -> np.ndarray:
