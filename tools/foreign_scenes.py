@@ -108,7 +108,7 @@ def measure(file, options):
             # mi.render() hides what was raised inside of it.
             while problem.__cause__ is not None:
                 problem = problem.__cause__
-            row["refused"].append(str(problem))
+            row["refused"].append(str(problem).removeprefix("aniso_pm: "))
             continue
         own = np.array([image.mean() for image in images])
         relative = [x.std(ddof=1) / ROUNDS**0.5 / x.mean() for x in (own, energy)]
@@ -159,8 +159,9 @@ def run(file, arguments):
     except subprocess.TimeoutExpired:
         return {"failed": "took longer than ten minutes"}
     printed, errors = (re.sub(r"\x1b\[\d*m", "", text) for text in (done.stdout, done.stderr))
-    warned = re.findall(r"aniso_pm: (.*)", printed + errors)
     last = [line for line in printed.splitlines() if line.startswith("{")]
+    said = [line for line in printed.splitlines() if line not in last] + errors.splitlines()
+    warned = re.findall(r"aniso_pm: (.*)", "\n".join(said))
     if not last:
         lines = [line for line in errors.splitlines() if line.strip()]
         return {"failed": lines[-1] if lines else f"exit status {done.returncode}"}
