@@ -127,14 +127,14 @@ def test_thinned_gathers_have_the_same_mean(variant_llvm_rgb):
     """Eight passes with few gathers against the same with a gather for every eye path."""
     scene = mi.load_dict(room_with_ball(size=24))
 
-    def mean(spp):
-        plugin = mi.load_dict({"type": "aniso_pm", "map": "global", "passes": 4})
+    def mean(spp, **parameters):
+        plugin = mi.load_dict({"type": "aniso_pm", "map": "global", "passes": 4, **parameters})
         image = np.array(mi.render(scene, integrator=plugin, spp=spp, seed=2), dtype=np.float64)
         return image.mean(), plugin.statistics
 
-    few, thinned = mean(4 * 64)
+    few, thinned = mean(4 * 64, photon_count=400_000)  # each gather meets many
     all_, full = mean(4 * 2)
-    assert thinned["share_of_gathers"] < 0.5 < 0.85 < full["share_of_gathers"]
+    assert thinned["share_of_gathers"] < 0.5 < 0.8 < full["share_of_gathers"]
     assert thinned["gather_points"] < thinned["eye_samples"]
     assert abs(few / all_ - 1) < 0.01  # eight samples a pixel: 0.3 %
 

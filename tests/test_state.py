@@ -99,7 +99,7 @@ def test_resuming_keeps_the_bandwidth_and_the_kernels_that_the_pilot_chose(tmp_p
 @pytest.mark.with_pilot
 def test_resumed_renderings_of_open_end_have_no_other_pilot(tmp_path, monkeypatch):
     path, scene = tmp_path / "a.state", load()
-    monkeypatch.setattr(survey, "_LONGEST", 2e5)  # a pass of fewer samples than are asked for
+    monkeypatch.setattr(survey, "_LONGEST", 1e5)  # a pass of fewer samples than are asked for
     parameters = {"initial_radius": 0.0, "photon_count": 0, "time": 1e-3}
     render(scene, integrator(**parameters), 64, checkpoint=Checkpoint(path))
     before = State.load(path)

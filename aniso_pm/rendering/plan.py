@@ -13,10 +13,12 @@ that errors are relative,
 A pass of n eye samples a pixel, of which a share q gathers, and N light paths (N_0 in the pilot)
 has the variance A/n + B/N, A = V_r + V_g/q, B = N_0 (V_p + V_gp/(q n)) (the noise of eye paths
 being what the film's filter leaves of it, that of shared photons the root of it), and costs
-n P (C + q (C_g + N C_m)) + N C_p, P the number of pixels, C_m the work of the photons of one light
-path that a gather meets. For given n, variance times cost is smallest at
+n P (C + q (C_g + N C_m)) + N C_p + C_0, P the number of pixels, C_m the work of the photons of one
+light path that a gather meets, C_0 what every pass costs. For given n, variance times cost is
+smallest at
 
-    q² = C (V_g + V_gp)/(V_r (C_g + N C_m)),    N² = n² P (C + q C_g) B / (A (C_p + n P q C_m)),
+    q² = C (V_g + V_gp)/(V_r (C_g + N C_m)),
+    N² = n (n P (C + q C_g) + C_0) B / (A (C_p + n P q C_m)),
 
 and with samples of a pixel in proportion to √((V_r + (V_g + V_gp)/q)/C) there, C the work of an eye
 path of that pixel. Costs are counted, not timed, so that every machine decides alike; those of
@@ -56,6 +58,10 @@ PASSES = 32
 LEAST_SHARE = 1 / 8
 # Work of a gather, each photon it meets, a light path, a photon it leaves; an eye path is about 1.
 _GATHER, _MET, LIGHT_PATH, LEFT = 2.0, 1 / 30, 0.6, 0.4
+# Work of a pass besides, however small: some thirty milliseconds.
+_PASS = 1.5e5
+# Light paths take so many times the work of all else at most.
+_TIMES = 10
 # Variance of an eye sample among a few hundred stratified ones, as a share of that among SAMPLES:
 # 0.59 among 52 and falling, in direct light.
 STRATIFIED = 0.45
@@ -165,7 +171,7 @@ class Plan:
         v_eye = STRATIFIED * float(v_own.mean()) + _LATER_STRATIFIED * float(np.mean(later))
         v_eye = filtered * max(v_eye, 0.0)
         if found is None:
-            pass_ = each * tiles.pixels * float(work.mean())
+            pass_ = each * tiles.pixels * float(work.mean()) + _PASS
             error = v_eye / each * pass_ / total
             share = np.full(1, 1.0 if use == "none" else LEAST_SHARE)
             nothing = np.zeros(len(whole))
@@ -189,7 +195,7 @@ class Plan:
         # --- Decisions ---
         share, paths = np.ones(len(whole)), float(light_paths or 5 * found.emitted)
         widths = np.full(len(whole), NARROW if choose else 1.0)
-        eye_work = float(work.mean())
+        samples, eye_work = each * tiles.pixels, float(work.mean())
         light, aimed = LIGHT_PATH + LEFT * found.stored / found.emitted, 1.0
         # Were all eye paths to gather: C_g, and C_m through kernels of the first width.
         point, photon = (smooth(tiles.grid(v)).ravel() for v in (found.points, found.met))
@@ -211,13 +217,15 @@ class Plan:
             eye_noise = max(v_eye + float((noise.gather / share).mean()), 1e-30)
             by_photons = max(0.0, float((b_1 / widths**2).mean()))
             if not light_paths:
-                of_one = light + each * tiles.pixels * float((photon * area * share).mean())
-                costs = (eye_work + float((point * share).mean())) / (of_one * tiles.pixels)
-                paths = max(each * tiles.pixels * math.sqrt(by_photons * costs / eye_noise), 1.0)
+                rest = samples * (eye_work + float((point * share).mean()))
+                of_one = light + samples * float((photon * area * share).mean())
+                paths = math.sqrt(each * (rest + _PASS) * by_photons / (of_one * eye_noise))
+                # Where eye paths have next to no noise: more of them save next to nothing.
+                paths = max(min(paths, (_TIMES * rest + _PASS) / of_one), 1.0)
 
         # --- What they promise ---
         gather = (point + photon * area * paths) * share
-        pass_ = each * tiles.pixels * (eye_work + float(gather.mean())) + paths * light
+        pass_ = samples * (eye_work + float(gather.mean())) + paths * light + _PASS
         left = pass_ / total
         error = (eye_noise / each + by_photons / paths) * left
         blur = noise.change * (widths / NARROW) ** 3 if choose else np.zeros(len(whole))
