@@ -132,11 +132,32 @@ def test_variances_are_those_of_the_samples(variant_llvm_rgb):
     assert v_alone.mean() == pytest.approx(0.5, rel=0.03)
 
 
-def _plan(light_paths=0, met=4000.0, aside=5.0):
+@pytest.mark.parametrize("use", ["global", "caustic"])
+def test_work_that_a_plan_counts_is_what_passes_do(variant_llvm_rgb, monkeypatch, use):
+    scene = mi.load_dict(room_with_ball(size=64))
+    plans, of = [], plan.Plan._of
+
+    def watched(each, **given):
+        plans.append((of(each, **given), given))
+        return plans[-1][0]
+
+    monkeypatch.setattr(plan.Plan, "_of", staticmethod(watched))
+    plugin = mi.load_dict({"type": "aniso_pm", "map": use, "kernel": "isotropic"})
+    mi.render(scene, integrator=plugin, spp=64)
+    found, given = plans[-1]
+    s = plugin.statistics
+    counted = 64 * found.tiles.pixels * float((found.path_work - given["whole"]).mean())
+    gathers = plan._GATHER * s["gather_points"] + plan._MET * s["photons_gathered"]
+    assert counted == pytest.approx(gathers, rel=0.25)
+    light = plan.LIGHT_PATH * s["photons_emitted"] + plan.LEFT * s["photons_stored"]
+    assert found.light_work == pytest.approx(light, rel=0.1)
+
+
+def _plan(light_paths=0, met=4000.0, aside=5.0, edge=2):
     """Of a picture whose left third has nearly all photons: so many that an eye path meets there,
-    and ``aside``; light beside it is smooth."""
+    and ``aside``; light beside it is smooth. edge: of tiles, in pixels."""
     random = np.random.default_rng(2)
-    tiles = Tiles(2, 96, 48)
+    tiles = Tiles(edge, 48 * edge, 24 * edge)
     left = np.zeros((tiles.down, tiles.across), bool)
     left[:, :16] = True
     left = left.ravel()
@@ -175,11 +196,21 @@ def _plan(light_paths=0, met=4000.0, aside=5.0):
     )
 
 
-def test_no_other_number_of_light_paths_promises_less():
-    best = _plan()
+@pytest.mark.parametrize("edge", [1, 2, 8])
+def test_no_other_number_of_light_paths_promises_less(edge):
+    best = _plan(edge=edge)
     assert best.light_paths > 1000
     for factor in (0.25, 0.5, 2, 4):
-        assert best.error < 1.1 * _plan(light_paths=factor * best.light_paths).error, factor
+        other = _plan(light_paths=factor * best.light_paths, edge=edge)
+        assert best.error < 1.1 * other.error, factor
+
+
+def test_what_every_pass_costs_is_worth_light_paths_in_small_pictures(monkeypatch):
+    with_it = [_plan(edge=edge).light_paths for edge in (1, 16)]
+    monkeypatch.setattr(plan, "_PASS", 0.0)
+    without = [_plan(edge=edge).light_paths for edge in (1, 16)]
+    small, large = (a / b for a, b in zip(with_it, without, strict=True))
+    assert small > 1.2 and large == pytest.approx(1, abs=0.1)
 
 
 def test_photons_that_gathers_meet_are_counted_where_they_are():

@@ -58,9 +58,9 @@ PASSES = 32
 LEAST_SHARE = 1 / 8
 # Work of a gather, each photon it meets, a light path, a photon it leaves; an eye path is about 1.
 _GATHER, _MET, LIGHT_PATH, LEFT = 2.0, 1 / 30, 0.6, 0.4
-# Work of a pass besides, however small: some thirty milliseconds.
+# Work of a pass besides, however small (docs/performance.md).
 _PASS = 1.5e5
-# Light paths take so many times the work of all else at most.
+# Light paths, and what meets their photons, are at most so many times the work of all else.
 _TIMES = 10
 # Variance of an eye sample among a few hundred stratified ones, as a share of that among SAMPLES:
 # 0.59 among 52 and falling, in direct light.
