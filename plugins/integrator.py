@@ -267,7 +267,7 @@ class AnisoPhotonMapper:
         self.progress: Callable[[float, int | None, str], None] | None = None
         self.callback: Callable[[int, Any, dict], None] | None = None
         self.checkpoint: Checkpoint | None = None
-        self.elsewhere: Callable[[progressive.Run], Iterator[Batch]] | None = None
+        self.elsewhere: Callable[[progressive.Run], None] | None = None
         self.first_pass = 0
         self._last_map: tuple | None = None
         self._exposed: dict[str, Any] = {}

@@ -132,14 +132,16 @@ METAL = {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.05}}
 
 
 @pytest.mark.parametrize(
-    "thickness, bsdf", [(0, METAL), (0.01, METAL), (0.01, {"type": "diffuse"})]
+    "thickness, bsdf",
+    [(0, METAL), (0.01, METAL), (0.01, {"type": "diffuse"}), (-0.01, {"type": "diffuse"})],
 )
 def test_what_lies_on_a_floor_does_not_darken_it(thickness, bsdf):
-    """Kernels of the floor beside a sheet or a coin reach under it, where no photons are."""
+    """Kernels of the floor beside a sheet or a coin, mirrored or not, reach under it, where no
+    photons are."""
     T = mi.ScalarTransform4f
     wall = T().translate([0, 1, 1]).rotate([1, 0, 0], 90)
     flat = T().translate([0, 0, 0.001]).scale(0.3)
-    thick = T().translate([0, 0, thickness / 2]).scale([0.3, 0.3, thickness / 2])
+    thick = T().translate([0, 0, abs(thickness) / 2]).scale([0.3, 0.3, thickness / 2])
     definition = {
         "type": "scene",
         "sensor": looking_down(offset=0.38, fov=2.5),
@@ -154,6 +156,31 @@ def test_what_lies_on_a_floor_does_not_darken_it(thickness, bsdf):
             "type": "cube" if thickness else "rectangle",
             "to_world": thick if thickness else flat,
             "bsdf": bsdf,
+        },
+    }
+    found, error = ratio(definition, 0.15)
+    print(found, error)
+    assert abs(found - 1) < 0.015 + 3 * error
+
+
+@pytest.mark.parametrize("bsdf", ["thindielectric", "dielectric", "null"])
+def test_a_floor_ends_where_a_pane_begins(bsdf):
+    """No photons lie on glass in the plane of the floor."""
+    T = mi.ScalarTransform4f
+    definition = {
+        "type": "scene",
+        "sensor": looking_down(offset=-0.04, fov=1.5),
+        "light": {"type": "point", "position": [-0.3, 0.5, 1.5]},
+        "floor": {"type": "rectangle", "to_world": T().translate([-1, 0, 0])},
+        "pane": {
+            "type": "rectangle",
+            "to_world": T().translate([1, 0, 0]),
+            "bsdf": {"type": bsdf},
+        },
+        "wall": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90),
+            "bsdf": {"type": "diffuse", "reflectance": 0.9},
         },
     }
     found, error = ratio(definition, 0.15)
@@ -203,5 +230,22 @@ def test_bump_maps_of_mirrored_cubes_look_where_those_of_path_do(mirror):
         "bsdf": bump | {"b": {"type": "diffuse", "reflectance": 0.8}},
     }
     found, error = ratio(room({"cube": cube}, size=16), 0.05)
+    print(found, error)
+    assert abs(found - 1) < 0.01 + 3 * error
+
+
+def test_light_goes_straight_through_bump_maps_of_what_is_like_air():
+    """The bounce does not turn: it has no normal of its own, from which cosines would follow."""
+    flat = np.full((2, 2, 1), 0.5, np.float32)
+    bump = {"type": "bumpmap", "arbitrary": {"type": "bitmap", "bitmap": mi.Bitmap(flat)}}
+    air = {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0}
+    ball = {"type": "sphere", "center": [0, -0.2, -0.2], "radius": 0.6, "bsdf": bump | {"b": air}}
+    scene = mi.load_dict(room({"ball": ball}, size=16))
+    ours = mi.load_dict(
+        {"type": "aniso_pm", "map": "global", "photon_count": 20_000, "initial_radius": 0.05}
+    )
+    mi.render(scene, integrator=ours, spp=16)
+    assert ours.statistics["photons_rejected"] == 0
+    found, error = ratio(room({"ball": ball}, size=16), 0.05)
     print(found, error)
     assert abs(found - 1) < 0.01 + 3 * error

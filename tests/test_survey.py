@@ -263,6 +263,15 @@ def test_a_map_thinned_holds_some_of_the_light_paths(variant_llvm_rgb):
     assert thinned(whole, 4000) is whole
 
 
+def test_a_pilot_looks_at_photons_one_by_one(variant_llvm_rgb):
+    """It reads parts of its maps, which no sums are of, and asks what each photon gives."""
+    exact, summed = (
+        settled(room_with_ball(size=64), map="global", gather_tolerance=t)[0] for t in (0.0, 0.2)
+    )
+    assert summed.count == exact.count
+    np.testing.assert_array_equal(summed.widths, exact.widths)
+
+
 def test_a_pilot_gathers_no_more_where_photons_lie_close(variant_llvm_rgb, monkeypatch):
     """In a room with the light inside, kernels of eight pixels of a small picture hold hundreds."""
     met = []

@@ -18,7 +18,7 @@ import threading
 import time
 import uuid
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -85,8 +85,8 @@ class Elsewhere:
         self.client, self.parcel, self.sensor = client, parcel, sensor
         self.options, self.warn = options or Options(), warn
 
-    def __call__(self, run: Run) -> Iterator[Batch]:
-        return _Dispatch(self, run).batches()
+    def __call__(self, run: Run) -> None:
+        _Dispatch(self, run).render()
 
     def job(self, run: Run) -> worker.Job:
         """What workers have to know."""
@@ -132,21 +132,23 @@ class _Dispatch:
         self.enough = False
         self.number = self.deaths = 0
 
-    def batches(self) -> Iterator[Batch]:
-        """Sums as they come home."""
+    def render(self) -> None:
+        """Give sums to the run as they come home. When that is interrupted, it gets what is ready
+        before the exception goes on."""
         self.run.stopping.close()  # the pilot's kernels are compiled
         self.client.subscribe_topic(self.job.name, lambda event: self.events.put(event[1]))
         try:
-            yield from self._loop()
+            self._loop()
         except BaseException as error:
             if isinstance(error, Failed) or is_interrupt(error):
-                yield from self._salvaged()
+                self._salvage()
             raise
         finally:
             self._close()
 
-    def _loop(self) -> Iterator[Batch]:
+    def _loop(self) -> None:
         while not self.ledger.finished:
+            self.run.interrupts.check()
             self._check_scheduler()
             self.crew.update()
             self._give_up_stranded()
@@ -157,7 +159,7 @@ class _Dispatch:
             self._unite()
             if self._home_is_due():
                 self._go_home()
-            yield from self._homecoming()
+            self._bring_home()
             if self.enough and not self.carriers:
                 return
 
@@ -394,8 +396,8 @@ class _Dispatch:
         self.homing = self._sum(ready) if len(ready) > 1 else ready[0]
         self.home = time.monotonic()
 
-    def _homecoming(self) -> Iterator[Batch]:
-        """The sum of all, if it is ready to be fetched."""
+    def _bring_home(self) -> None:
+        """Give the sum of all to the run, if it is ready to be fetched."""
         carrier = self.homing
         if carrier is None or not carrier.done:
             return
@@ -413,7 +415,7 @@ class _Dispatch:
             self._lost(carrier)
             return
         if self.ledger.count(carrier.key):
-            yield Batch(**found)
+            self.run.add(Batch(**found))
         self._drop(carrier)
         self.home_cost = time.monotonic() - self.home
         self.home = time.monotonic()
@@ -426,8 +428,8 @@ class _Dispatch:
             found = error
         self.events.put({"what": "fetched", "task": carrier.key, "found": found})
 
-    def _salvaged(self) -> Iterator[Batch]:
-        """What is ready on the workers, if it comes soon."""
+    def _salvage(self) -> None:
+        """Give what is ready on the workers to the run, if it comes soon."""
         until = time.monotonic() + _SALVAGE
         try:
             for carrier in self.rendering:
@@ -436,7 +438,7 @@ class _Dispatch:
                 # One after the other: additions would wait for tasks that cannot be stopped.
                 if not self.homing:
                     self.homing = next((c for c in self.carriers.values() if c.done), None)
-                yield from self._homecoming()
+                self._bring_home()
                 self._hear(0.1)
         except (Failed, OSError):
             return  # nothing more to be had

@@ -288,19 +288,20 @@ def probe_surface(
         tries += dr.select(fresh, mi.UInt32(1), 0)
         probe = mi.Ray3f(q + n * (height - depth), -n)
         probe.maxt = 2 * height - depth
-        si = scene.ray_intersect(probe, mi.RayFlags.Minimal, True, probing)
+        si = scene.ray_intersect(probe, mi.RayFlags.ShadingFrame, True, probing)
         cosine, d = dr.dot(si.n, n), si.p - points.p
         on_surface = si.is_valid() & (dr.abs(cosine) > NORMAL_COS)
         if dr.hint(points.wall is not None, mode="scalar"):
             on_surface &= ~points.wall.hides(d)
         on_surface &= smooth_between(n, dr.mulsign(mi.Vector3f(si.n), cosine), d, rounding)
-        # Backs are passed: light arrives between them and the surface. So is glass, which is the
-        # surface where their faces coincide. Under all else no light arrives.
-        passes = cosine < 0
+        # Backs are passed: light arrives between them and the surface. So is glass; where its back
+        # is met on the surface, that is the face below it. Under all else no light arrives. Of
+        # mirrored shapes si.n is inside; the back is where BSDFs have it.
+        passes = dr.mulsign(cosine, dr.dot(si.n, si.sh_frame.n)) < 0
         if cover is not None:
             gathers, clear = cover(si.bsdf(), probing & si.is_valid())
+            on_surface &= gathers | (clear & passes)
             passes |= clear
-            on_surface &= gathers | clear
         landed |= probing & on_surface
         depth += si.t + 1e-3 * height + rounding
         fresh = ~(si.is_valid() & passes) | (depth >= 2 * height)

@@ -118,6 +118,7 @@ def _part(map_: PhotonMap, slot, emitted: int) -> PhotonMap:
     )
     dr.eval(photons)
     nothing = replace(map_, emitted=emitted, stored=0, index=None, flux=None, direction=None)
+    nothing = replace(nothing, sums=None)  # those were of another index
     return indexed(photons, dr.width(slot), nothing)
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .done import Batch
 from .prepared import Prepared
 from .settled import Settled
 from .state import Checkpoint
@@ -30,8 +29,8 @@ class Controls:
     so_far      called as so_far(variance, layers, passes), as in ``Rendered``, before somebody else
                 looks at the picture so far.
     settled     what a pilot has chosen, on another machine; None: one will choose here.
-    elsewhere   who renders the passes, if not this process: called with the ``Run``, gives them as
-                ``Batch``es. progress and callback are then called after each of those.
+    elsewhere   who renders the passes, if not this process: called with the ``Run``, gives them to
+                its ``add``. progress and callback are then called after each of those.
     """
 
     first_pass: int = 0
@@ -40,7 +39,7 @@ class Controls:
     checkpoint: Checkpoint | None = None
     so_far: Callable[[Any, Any, int], None] | None = None
     settled: Settled | None = None
-    elsewhere: Callable[[Run], Iterator[Batch]] | None = None
+    elsewhere: Callable[[Run], None] | None = None
 
 
 @dataclass

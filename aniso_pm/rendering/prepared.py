@@ -151,7 +151,8 @@ class Prepared(Decisions):
             lap=lap,
             wavefront=self.light_wavefront,
         )
-        if s.gather_tolerance > 0 and map_.stored:
+        # A pilot asks what each photon gives, and reads parts of its maps.
+        if s.gather_tolerance > 0 and map_.stored and not remember:
             map_ = replace(map_, sums=summed.build(map_))
             lap("index")
         return map_

@@ -46,16 +46,14 @@ def render(scene: Prepared, sensor, seed: int, spp: int, controls: Controls, sta
     """
     run = Run(scene, sensor, seed, spp, controls, statistics)
     try:
-        with Interrupts() as interrupts:
+        with run.interrupts:
             run.start()
             if controls.elsewhere:
-                for batch in controls.elsewhere(run):
-                    run.add(batch)
-                    interrupts.check()
+                controls.elsewhere(run)
             else:
                 for index in run.numbers():
                     run.render_pass(index)
-                    interrupts.check()
+                    run.interrupts.check()
     except BaseException as error:
         failed = isinstance(error, Failed)
         if not (failed or is_interrupt(error)) or not run.keep_unfinished():
@@ -82,6 +80,7 @@ class Run:
         self.controls, self.statistics = controls, statistics
         self.film = sensor.film()
         self.stopping = Stopping(scene.settings)
+        self.interrupts = Interrupts()
         self.clock = Clock()
         self.radius = self.variance = None
         self.done = Done.nothing()
@@ -187,6 +186,7 @@ class Run:
     def add(self, batch: Batch):
         """Passes that were rendered elsewhere, and what is due after them."""
         self.done = self.done.with_batch(batch)
+        self.clock.skip()  # the time of those who rendered them counts
         self.clock.go_on_from(batch.seconds)
         last = self.done.passes[-1][1] - 1
         self.radius = bandwidth(self.decided.settled.radius, self.given.settings.alpha, last)

@@ -19,6 +19,10 @@ class Clock:
         for stage, spent in seconds.items():
             self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
 
+    def skip(self):
+        """What was done since the last lap is no stage: waiting."""
+        self.last = time.perf_counter()
+
     def lap(self, stage: str):
         """What was done since the last lap was ``stage``."""
         dr.sync_thread()

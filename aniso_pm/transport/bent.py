@@ -26,8 +26,8 @@ def bent_bounce(ctx, bsdf, si, bs, weight, sampler, active):
     """(BSDF sample, f(v, l)/p or delta weight) at bump and normal maps, see above."""
     m = si.wi + bs.wo * bs.eta  # along the normal that a delta bounce knows
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    cosines = dr.abs(dr.dot(m, si.wi) / dr.dot(m, bs.wo))
-    cosines = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null), 1, cosines)
+    straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) | (dr.squared_norm(m) < 1e-8)
+    cosines = dr.select(straight, 1, dr.abs(dr.dot(m, si.wi) / dr.dot(m, bs.wo)))
 
     share = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth), mi.Float(DRAWN), 0)
     drawn = active & (sampler.next_1d(active) < share)
