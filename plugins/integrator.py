@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, fields
 from functools import partial
 from typing import Any
@@ -13,7 +13,6 @@ import numpy as np
 from aniso_pm.errors import Unsupported
 from aniso_pm.rendering import progressive
 from aniso_pm.rendering.controls import Controls
-from aniso_pm.rendering.done import Batch
 from aniso_pm.rendering.film import pixel_weights as film_weights
 from aniso_pm.rendering.layered import develop
 from aniso_pm.rendering.pilot import USUAL, automatic_radius

@@ -216,6 +216,15 @@ def test_scenes_without_integrator_are_examined_for_aniso_pm(run, write_scene, c
     assert status == 0 and stdout, stderr
 
 
+@pytest.mark.parametrize("command", [["inspect"], ["explain", "--pixel", "8,8"]])
+def test_scenes_are_examined_for_as_many_samples_as_are_rendered(run, write_scene, command):
+    passes = '<integer name="passes" value="400"/>'
+    scene = write_scene(f'<integrator type="aniso_pm">{passes}</integrator>')
+    assert_one_line(run(*command, scene), "cannot be shared by 400 passes")
+    status, stdout, stderr = run(*command, scene, "--spp", 400)
+    assert status == 0 and stdout, stderr
+
+
 def test_closed_streams_are_no_error(run, write_scene, monkeypatch):
     for stream in ("stdout", "stderr"):
         monkeypatch.setattr(sys, stream, None)

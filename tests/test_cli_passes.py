@@ -50,6 +50,22 @@ def test_passes_rendered_apart_merge_into_the_whole(run, write_scene):
     assert_one_line(run("merge", "a.exr", "s.exr", "-o", "d.exr"), "seed was 7, is 0")
 
 
+def test_ctrl_c_while_the_picture_is_written_tells_of_the_state(
+    run, write_scene, tmp_path, monkeypatch
+):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    path = write_scene(OURS)
+    options = ["-o", "a.exr", "--passes", 2]
+    with monkeypatch.context() as patch:
+        patch.setattr("aniso_pm.cli.pictures.Pictures.write", interrupted)
+        result = run("render", path, *options)
+    assert result[0] == 130 and "'a.state' holds the passes so far, --resume" in result[2]
+    assert State.load(tmp_path / "a.state").passes == [[0, 2]]
+    assert run("render", path, *options, "--resume")[0] == 0
+
+
 def test_kept_states_are_not_lost(run, write_scene, tmp_path):
     path = write_scene(OURS)
     run("render", path, "-o", "a.exr", "--passes", 2, "--keep-state", "--quiet")

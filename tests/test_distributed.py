@@ -54,6 +54,21 @@ def assert_same_picture(found, expected):
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-4)
 
 
+def test_workers_of_one_machine_share_its_memory(client, monkeypatch):
+    def share():
+        import dask
+        from aniso_pm.distributed.cluster import MEMORY_SHARE
+
+        return dask.config.get(MEMORY_SHARE, 1.0)
+
+    assert list(client.run(share).values()) == [0.5, 0.5]
+    monkeypatch.setattr("aniso_pm.rendering.memory.available", lambda: 8 * 2**30)
+    planned = worker._planned
+    assert planned(0.0, None, 0.5) == 3 and planned(2.0, None, 0.5) == 1
+    assert planned(0.0, None, 1.0) == 0
+    assert planned(0.0, 5.0, 1.0) == 5 and planned(2.0, 5.0, 1.0) == 2
+
+
 def addresses(client):
     return sorted(client.scheduler_info()["workers"])
 

@@ -5,6 +5,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from aniso_pm.rendering.state import Checkpoint
 from renders import array, camera_with_alpha, integrator
 from rooms import room, room_with_plate
 
@@ -102,7 +103,8 @@ def test_lamps_coloured_by_a_mesh_attribute_are_refused_with_one_sentence(rgb, t
         integrator().render(mi.load_dict(definition), spp=1)
 
 
-def test_a_scene_without_shapes_is_rendered(rgb):
+@pytest.mark.with_pilot
+def test_a_scene_without_shapes_is_rendered(rgb, tmp_path):
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -110,8 +112,12 @@ def test_a_scene_without_shapes_is_rendered(rgb):
             "sky": {"type": "constant", "radiance": 0.25},
         }
     )
-    image = array(mi.render(scene, integrator=integrator(initial_radius=0.0), spp=4))
-    np.testing.assert_allclose(image[..., :3], 0.25, rtol=1e-3)
+    for passes in (1, 2, 4):  # the last ones resumed
+        plugin = integrator(initial_radius=0.0, passes=passes)
+        if passes > 1:
+            plugin.checkpoint = Checkpoint(tmp_path / "a.state", resume=True)
+        image = array(mi.render(scene, integrator=plugin, spp=4 * passes))
+        np.testing.assert_allclose(image[..., :3], 0.25, rtol=1e-3)
 
 
 @pytest.mark.parametrize("instanced", [False, True])

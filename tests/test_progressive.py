@@ -10,7 +10,7 @@ import aniso_pm  # noqa: F401
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.rendering import progress, schedule
+from aniso_pm.rendering import progress, progressive, schedule
 from aniso_pm.rendering.accumulate import Sums, mean_and_variance, relative_standard_error
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.state import Checkpoint, State
@@ -81,8 +81,18 @@ def test_samples_are_shared_evenly_and_open_ends_take_short_passes(parameters, s
 
 
 def test_sample_numbers_that_a_pixel_does_not_have_are_refused():
-    with pytest.raises(ValueError, match="beyond sample 536870912 of a pixel"):
+    with pytest.raises(ValueError, match="beyond sample 536870912 of a pixel; count them from"):
         schedule.shares(Settings(passes=1), 1024, 64, first_pass=5_000_000)
+    with pytest.raises(ValueError, match="beyond sample 536870912 of a pixel; take less"):
+        schedule.shares(Settings(passes=1), 600_000_000, 1)
+
+
+def test_a_rendering_without_end_stops_where_a_pixel_has_no_more_samples(monkeypatch):
+    monkeypatch.setattr(progressive, "LARGEST", 100)
+    plugin = integrator(passes=0, time=1e6)
+    image = render(load(8), plugin, 16)
+    assert plugin.statistics["passes"] == 6 and np.isfinite(image).all()
+    assert "pass 6 goes beyond sample 100 of a pixel" in plugin.statistics["failure"]
 
 
 @pytest.mark.with_pilot

@@ -62,6 +62,10 @@ def test_states_merge_into_the_picture_of_all_passes(states):
     plugin = integrator(passes=4)
     render(scene, plugin, 8)
     np.testing.assert_allclose(total.variance(), plugin.variance, rtol=0.02, atol=1e-7)
+    # Told of all passes, not of those of one state.
+    error, radius = (plugin.statistics[name] for name in ("relative_error", "radius"))
+    assert total.statistics["relative_error"] == pytest.approx(error, rel=0.02)
+    assert total.statistics["radius"] == pytest.approx(radius)
 
 
 def test_resuming_renders_the_missing_passes_only(states):
@@ -347,6 +351,18 @@ def test_checkpoints_of_films_with_alpha_crop_and_other_colours(tmp_path):
     assert image.shape == (8, 5, 2)
     close(np.array(film.develop()), image)
     assert state.variance().shape == (8, 5, 4)
+
+
+@pytest.mark.parametrize("rfilter, least", [("gaussian", 0.0), ("lanczos", -1.0)])
+def test_films_of_states_keep_what_their_filter_leaves_below_zero(rfilter, least):
+    from aniso_pm.rendering import film as films
+
+    whole = {"type": "hdrfilm", "width": 2, "height": 2, "rfilter": {"type": rfilter}}
+    film = films.from_description(films.describe(mi.load_dict(whole)))
+    sums = np.ones((2, 2, film.create_block().channel_count()))
+    sums[0, 0, :3] = -1
+    films.show_array(film, sums)
+    assert np.array(film.develop())[0, 0, :3] == pytest.approx(least)
 
 
 def test_lights_without_shape_and_instanced_shapes_are_part_of_the_scene():

@@ -16,6 +16,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from aniso_pm.errors import InputError
+from aniso_pm.pictures.output import OutputError
 from aniso_pm.rendering.state import Checkpoint
 from aniso_pm.view import server
 from aniso_pm.view.session import Session
@@ -101,6 +102,18 @@ def test_the_time_that_others_take_does_not_count(variant_llvm_rgb, ticking):
     plugin.callback = lambda *_: ticking(100.0)
     plugin.render(mi.load_dict(room(size=4)), spp=1)
     assert plugin.statistics["passes"] > 2
+
+
+def test_a_picture_that_cannot_be_saved_is_shown_all_the_same(variant_llvm_rgb):
+    def save():
+        raise OutputError("cannot write 'a.exr': no space left on device")
+
+    world = mi.load_dict(room(size=4))
+    plugin = mi.load_dict({"type": "aniso_pm", "passes": 2, "map": "global", "photon_count": 500})
+    session = Session("room", world, world.sensors()[0], plugin, 0, 2, save)
+    session.quit()
+    session.run()
+    assert session.status()["message"].startswith("not saved: cannot write 'a.exr'")
 
 
 def test_what_fails_is_shown(variant_llvm_rgb):

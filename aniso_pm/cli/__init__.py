@@ -44,8 +44,10 @@ def main(arguments: list[str] | None = None) -> int:
     except BaseException as error:
         if hasattr(error, "format_message"):  # typer's own: wrong usage
             return _fail(2, f"{error.format_message()} (see aniso-pm --help)", error)
-        if isinstance(error, InterruptError | typer.Abort | KeyboardInterrupt):
-            return _fail(INTERRUPTED, "interrupted, nothing written", error)
+        if isinstance(error, InterruptError):
+            return _fail(INTERRUPTED, str(error), error)
+        if isinstance(error, typer.Abort | KeyboardInterrupt):
+            return _fail(INTERRUPTED, str(InterruptError()), error)
         if isinstance(error, SystemExit):
             raise
         return _fail(1, f"{type(error).__name__}: {one_line(error)}", error)

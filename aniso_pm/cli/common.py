@@ -55,7 +55,11 @@ Layers = Annotated[
 
 
 class InterruptError(Exception):
-    """Ctrl-C before there was a picture (typer would end silently on KeyboardInterrupt itself)."""
+    """Ctrl-C before there was a picture (typer would end silently on KeyboardInterrupt itself).
+    The message says what there is."""
+
+    def __init__(self, message: str = "interrupted, nothing written"):
+        super().__init__(message)
 
 
 def interruptible(command: Callable[..., int]) -> Callable[..., int]:
@@ -67,11 +71,29 @@ def interruptible(command: Callable[..., int]) -> Callable[..., int]:
         try:
             return command(*args, **options)
         except BaseException as error:
-            if is_interrupt(error) and not isinstance(error, output.OutputError):
+            if _is_only_interrupt(error):
                 raise InterruptError from error
             raise
 
     return run
+
+
+def _is_only_interrupt(error: BaseException) -> bool:
+    told = isinstance(error, output.OutputError | InterruptError)
+    return is_interrupt(error) and not told
+
+
+@contextmanager
+def telling_what_is_kept(state: Path) -> Iterator[None]:
+    """Ctrl-C says so where there is a state to go on from."""
+    try:
+        yield
+    except BaseException as error:
+        if _is_only_interrupt(error) and state.exists():
+            raise InterruptError(
+                f"interrupted; '{state}' holds the passes so far, --resume goes on with them"
+            ) from error
+        raise
 
 
 def make_directory(path: Path) -> None:

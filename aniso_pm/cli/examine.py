@@ -11,6 +11,7 @@ from aniso_pm.errors import InputError, one_line
 
 from .common import (
     Define,
+    Samples,
     SceneFile,
     Variant,
     load,
@@ -25,6 +26,7 @@ def inspect(
     scene: SceneFile,
     variant: Variant = "llvm_ad_rgb",
     define: Define = None,
+    spp: Samples = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON list.")] = False,
 ) -> int:
     """Say what a scene needs of the photon mapper, what is left out, and why.
@@ -43,7 +45,7 @@ def inspect(
         settings = getattr(integrator, "settings", None) or Settings()
         try:
             prepared = prepare(world, settings, False)
-            findings = inspection.examine(prepared, compile_=True)
+            findings = inspection.examine(prepared, compile_=True, spp=spp or 0)
         except ValueError as error:
             raise InputError(one_line(error)) from error
     if as_json:

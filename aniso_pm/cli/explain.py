@@ -11,7 +11,16 @@ import typer
 from aniso_pm.errors import InputError, one_line
 from aniso_pm.pictures import output
 
-from .common import Define, SceneFile, Variant, load, mitsuba_log, parse_defines, set_variant
+from .common import (
+    Define,
+    Samples,
+    SceneFile,
+    Variant,
+    load,
+    mitsuba_log,
+    parse_defines,
+    set_variant,
+)
 
 _SUFFIXES = (".png", ".svg")
 
@@ -26,6 +35,7 @@ def explain(
     ] = None,
     variant: Variant = "llvm_ad_rgb",
     define: Define = None,
+    spp: Samples = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Random seed.")] = 0,
     pass_index: Annotated[
         int, typer.Option("--pass", min=0, max=10**7, help="Photons of this pass.")
@@ -55,7 +65,7 @@ def explain(
 
         try:
             found = explanation.explain(
-                world, place, integrator, camera, seed, pass_index, sample=sample
+                world, place, integrator, camera, seed, pass_index, sample=sample, spp=spp or 0
             )
         except ValueError as error:
             raise InputError(one_line(error)) from error

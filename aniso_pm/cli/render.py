@@ -34,6 +34,7 @@ from .common import (
     parse_parameters,
     set_variant,
     stopping_rules,
+    telling_what_is_kept,
 )
 from .pictures import Bits, Denoise, Exposure, Pictures, Png, Tonemap
 from .workers import (
@@ -168,23 +169,24 @@ def render(
             integrator.checkpoint = Checkpoint(state_file, save_every, resume, write)
             if resume and not state_file.exists() and not quiet:
                 print(f"aniso-pm: no state '{state_file}' yet, starting afresh", file=sys.stderr)
-        with rendering_elsewhere(
-            integrator,
-            scene,
-            defines,
-            sensor,
-            workers,
-            scheduler,
-            scheduler_file,
-            {"ca_file": tls_ca_file, "client_cert": tls_cert, "client_key": tls_key},
-            mixed=mixed,
-            task_seconds=task_seconds,
-            task_limit=task_limit,
-            # As often as the picture is saved.
-            home_every=max(save_every, 1.0),
-        ):
-            _render(world, camera, integrator, seed, spp, quiet)
-        record = write()
+        with telling_what_is_kept(state_file):
+            with rendering_elsewhere(
+                integrator,
+                scene,
+                defines,
+                sensor,
+                workers,
+                scheduler,
+                scheduler_file,
+                {"ca_file": tls_ca_file, "client_cert": tls_cert, "client_key": tls_key},
+                mixed=mixed,
+                task_seconds=task_seconds,
+                task_limit=task_limit,
+                # As often as the picture is saved.
+                home_every=max(save_every, 1.0),
+            ):
+                _render(world, camera, integrator, seed, spp, quiet)
+            record = write()
         statistics = record["statistics"]
         if kept is False and not statistics["interrupted"] and not statistics.get("failure"):
             state_file.unlink(missing_ok=True)

@@ -17,6 +17,8 @@ from aniso_pm.errors import Failed, InputError, one_line
 _CONNECT = 10
 # Ctrl-C is for the client to take, which asks the workers for what they have.
 _PRELOAD = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+# Key of Dask's configuration: the part of the memory of its machine that a worker may plan with.
+MEMORY_SHARE = "aniso_pm.memory_share"
 # Only this machine reaches local clusters.
 _LOOPBACK = "127.0.0.1"
 
@@ -33,8 +35,8 @@ def require() -> None:
 
 @contextmanager
 def local(workers: int) -> Iterator[Any]:
-    """A client of as many worker processes on this machine, which share its cores, and end with the
-    block. They listen on the loopback address only."""
+    """A client of as many worker processes on this machine, which share its cores and its memory,
+    and end with the block. They listen on the loopback address only."""
     require()
     import dask
     from distributed import Client, LocalCluster
@@ -42,6 +44,8 @@ def local(workers: int) -> Iterator[Any]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     settings = {
         "distributed.worker.daemon": True,
+        # What workers inherit; they plan at the same time.
+        MEMORY_SHARE: 1 / workers,
         # Statements about single tasks are ours.
         "distributed.admin.large-graph-warning-threshold": "1GB",
         "distributed.scheduler.allowed-failures": 10,
@@ -58,7 +62,7 @@ def local(workers: int) -> Iterator[Any]:
                 host=_LOOPBACK,
                 dashboard_address=f"{_LOOPBACK}:0",
                 local_directory=folder,
-                memory_limit=0,  # renderings keep within max_memory
+                memory_limit=0,  # renderings keep within their share
                 preload=_PRELOAD,
                 silence_logs=logging.CRITICAL,
             )

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from .cluster import MEMORY_SHARE
 from .parcel import Parcel
 
 # Scenes that a worker keeps.
@@ -116,7 +117,7 @@ _jobs: OrderedDict[str, _Rendering] = OrderedDict()
 class _Rendering:
     """A job, ready on this worker."""
 
-    def __init__(self, job: Job, threads: int, limit: float | None, directory: Path):
+    def __init__(self, job: Job, worker: _Worker):
         import drjit as dr
         import mitsuba as mi
         from aniso_pm.rendering import progressive
@@ -133,17 +134,19 @@ class _Rendering:
         on_cpu = mi.variant().startswith("llvm")
         if on_cpu:
             # Mitsuba (3.9) waits forever for the lines of an EXR file where there is one thread.
-            dr.set_thread_count(max(2, threads))
-        world = job.parcel.load(directory)
+            dr.set_thread_count(max(2, worker.threads))
+        world = job.parcel.load(worker.directory)
         if on_cpu:
-            dr.set_thread_count(threads)
+            dr.set_thread_count(worker.threads)
         sensor = world.sensors()[job.render["sensor"]]
         found = differences(job.scene, scene_entries(world) | camera_entries(sensor))
         if found:
             raise Differs(f"it has loaded another scene than the client: {'; '.join(found[:3])}")
         settings = Settings(**job.render["settings"])
-        if limit and on_cpu and not settings.max_memory:  # a GPU has memory of its own
-            settings = settings.with_(max_memory=limit)
+        # A GPU has memory of its own.
+        limit = worker.memory if on_cpu else None
+        memory = _planned(settings.max_memory, limit, worker.memory_share)
+        settings = settings.with_(max_memory=memory)
         prepared = prepare(world, settings, job.render["hide_emitters"])
         settled = job.render["settled"]
         controls = Controls(job.render["first_pass"], settled=settled)
@@ -152,7 +155,7 @@ class _Rendering:
         self.run.start()
         self.variance = job.render["variance"]
         self.used = False
-        self.facts = {"variant": mi.variant(), "threads": threads, "process": os.getpid()}
+        self.facts = {"variant": mi.variant(), "threads": worker.threads, "process": os.getpid()}
 
     def passes(self, ranges):
         """(Batch of these passes, seconds spent on compilation)."""
@@ -177,10 +180,20 @@ def _joined(job: Job) -> _Rendering:
             while len(_jobs) >= _KEPT:
                 _jobs.popitem(last=False)
             with worker.quiet():
-                made = _Rendering(job, worker.threads, worker.memory, worker.directory)
+                made = _Rendering(job, worker)
             _jobs[job.name] = made
         _jobs.move_to_end(job.name)
         return _jobs[job.name]
+
+
+def _planned(given: float, limit: float | None, share: float) -> float:
+    """``max_memory`` of a worker, GiB; 0: automatic. given: of all on this machine; limit: that it
+    has from elsewhere."""
+    from aniso_pm.rendering import memory
+
+    if given or share == 1:
+        return share * given or limit or 0.0
+    return limit or share * memory.automatic() / memory.GIB
 
 
 def _set_variant(job: Job) -> None:
@@ -224,6 +237,13 @@ class _Worker:
         """GiB that a rendering may take: three quarters of the worker's limit, if it has one."""
         limit = self._worker.memory_manager.memory_limit
         return 0.75 * limit / 2**30 if limit else None
+
+    @property
+    def memory_share(self) -> float:
+        """Part of this machine's memory that is for this worker."""
+        import dask
+
+        return dask.config.get(MEMORY_SHARE, 1.0)
 
     def tell(self, job: Job, task: str, what: str, **more) -> None:
         self._worker.log_event(

@@ -26,11 +26,11 @@ class Finding:
     evidence: list[str]
 
 
-def examine(scene: Prepared, compile_: bool = False) -> list[Finding]:
+def examine(scene: Prepared, compile_: bool = False, spp: int = 0) -> list[Finding]:
     """All decisions that were taken for a scene and its integrator's parameters. Where there is a
-    map a pilot is traced through the scene's first sensor, as before a rendering. compile_: say
-    what is compiled, too."""
-    scene, why_map, why_aim, of_lobes = decided(scene)
+    map a pilot is traced through the scene's first sensor, as before a rendering of ``spp``
+    samples (0: those of the sampler). compile_: say what is compiled, too."""
+    scene, why_map, why_aim, of_lobes = decided(scene, spp)
     needs, settings = scene.needs, scene.settings
     shown = scene.follow_lobes
     why_disc = ["parameter kernel=isotropic" if settings.kernel == "isotropic" else "none found"]
@@ -210,14 +210,14 @@ def kernels(scene: Prepared) -> Finding:
     return Finding("kernels", True, f"{number} kernels, {operations:,} operations", evidence)
 
 
-def decided(scene: Prepared) -> tuple[Prepared, list[str], str, float]:
+def decided(scene: Prepared, spp: int = 0) -> tuple[Prepared, list[str], str, float]:
     """The scene as a pilot has decided, what ``map=auto`` went by, why light paths are aimed or
     not, and the part of the error that kernels behind lobes make."""
     if not scene.needs_map:
         causes = ["nothing casts caustics"] if scene.settings.map == "auto" else []
         return scene, [f"map=auto: {cause}" for cause in causes], "there are no light paths", 0.0
     sensor = scene.scene.sensors()[0]
-    spp, pixels = sample_count(scene.settings, 0, sensor), pixel_count(sensor.film())
+    spp, pixels = sample_count(scene.settings, spp, sensor), pixel_count(sensor.film())
     found = settle(scene, sensor, 0, shares(scene.settings, spp, pixels).each)
     why = []
     if scene.undecided:

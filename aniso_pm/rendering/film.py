@@ -157,6 +157,8 @@ def from_description(description: dict[str, Any]):
             f"aniso_pm: the passes were rendered for a {description['kind']}; only those for an "
             "hdrfilm can be developed without their scene"
         )
+    # Sums are filtered already. What is left to tell is whether they may be below zero.
+    rfilter = "catmullrom" if min(description["filter"]) < 0 else "box"
     (width, height), crop = description["size"], description["crop_size"]
     offset = description["crop_offset"]
     film = mi.load_dict(
@@ -168,7 +170,7 @@ def from_description(description: dict[str, Any]):
             "crop_height": crop[1],
             "crop_offset_x": offset[0],
             "crop_offset_y": offset[1],
-            "rfilter": {"type": "box"},
+            "rfilter": {"type": rfilter},
             **description["formats"],
         }
     )

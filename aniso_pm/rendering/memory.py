@@ -164,9 +164,13 @@ def _limit(max_memory: float) -> tuple[float, str]:
     """(bytes that may be used, what to call them)."""
     if max_memory:
         return max_memory * GIB, f"{max_memory:g} GiB"
-    free = available()
-    share = _SHARE * free
+    share = automatic()
     return share, f"0 (automatic: {_gib(share)} GiB, three quarters of what is available)"
+
+
+def automatic() -> float:
+    """Bytes that may be used where nobody says how many."""
+    return _SHARE * available()
 
 
 def available() -> float:

@@ -157,11 +157,12 @@ def radius_at(points, map_, scene: Prepared, light_paths: float) -> float:
     paths, in the median over gather points (GatherPoints or None).
 
     Returns a hundredth of the extent of the scene (or of its part that light from outside is to
-    meet) where there is nothing to gather, and never more than a tenth of it.
+    meet) where there is nothing to gather (1 where there are no shapes), and never more than a
+    tenth of it.
     """
     extent = min(scene.extent, 2 * scene.focus.radius) if scene.focus else scene.extent
     if points is None or not map_.stored:
-        return 0.01 * extent
+        return 0.01 * extent if math.isfinite(extent) else 1.0
     count = dr.width(points.lane)
     if count > _RAYS:
         points = take(points, dr.arange(mi.UInt32, _RAYS) * (count // _RAYS))

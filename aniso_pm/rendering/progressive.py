@@ -27,7 +27,7 @@ from .done import Batch, Done
 from .interrupts import Interrupts
 from .one_pass import Tracer
 from .prepared import Prepared
-from .schedule import bandwidth
+from .schedule import LARGEST, bandwidth
 from .stage_times import Clock
 from .stopping import Stopping
 
@@ -150,6 +150,11 @@ class Run:
             error = self.statistics["relative_error"] if due else None
             if self.stopping.reached(len(done), error):
                 return
+            if self.decided.shares.before(index + 1) > LARGEST:
+                raise Failed(
+                    f"aniso_pm: pass {index} goes beyond sample {LARGEST} of a pixel, the last "
+                    "that has a number; go on with another seed"
+                )
             yield index
             done.add(index)
 

@@ -12,6 +12,8 @@ from .settings import Settings
 # Eye samples of a pass where the number of passes is open: short against any budget. More where
 # that would be less than FEW a pixel, up to LARGE_PASS.
 OPEN_PASS, LARGE_PASS = 1 << 19, 1 << 21
+# Samples of a pixel that have a number, were all pixels to get as many as one may.
+LARGEST = int(2**32 / MOST)
 # Samples per pixel of such a pass where nobody but the scene's sampler says how many: that of
 # Mitsuba takes 4 by itself, and passes so small have up to half again the error after a time.
 _SEVERAL = 8
@@ -75,11 +77,14 @@ def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Sh
             f"aniso_pm: {spp} samples per pixel cannot be shared by {passes} passes; "
             f'raise the sample count to {passes} or lower the parameter "passes"'
         )
-    last, largest = first_pass + max(passes, 1), int(2**32 / MOST)
-    if last * (each + bool(rest)) > largest:
+    last = first_pass + max(passes, 1)
+    if last * (each + bool(rest)) > LARGEST:
+        remedy = "take less"
+        if first_pass:
+            remedy = "count them from a smaller number, with another seed"
         raise ValueError(
             f"aniso_pm: passes {first_pass} to {last - 1} of {each} samples per pixel go beyond "
-            f"sample {largest} of a pixel; count them from a smaller number, with another seed"
+            f"sample {LARGEST} of a pixel; {remedy}"
         )
     text = f"{spp} by {passes} from pass {first_pass}" if rest else str(each)
     return Shares(each, range(first_pass, first_pass + rest), text)

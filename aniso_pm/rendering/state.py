@@ -16,7 +16,7 @@ import json
 import time
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from ..pictures import output
 from ..transport.layers import parse
-from .accumulate import mean_and_variance
+from .accumulate import mean_and_variance, relative_standard_error
 from .digest import differences
 from .layered import develop
 from .settled import Settled
@@ -88,6 +88,12 @@ class State:
     def variance(self) -> np.ndarray | None:
         """Variance of the picture, height × width × channels; None with one pass."""
         return mean_and_variance(self.arrays, self.count)[1] if self.count > 1 else None
+
+    def relative_error(self) -> float | None:
+        """Of the picture, as statistics have it; None with one pass."""
+        if self.count < 2:
+            return None
+        return relative_standard_error(*mean_and_variance(self.arrays, self.count))
 
     def layer_sums(self) -> dict[str, np.ndarray]:
         """The sums of layers; see ``layered``."""
@@ -159,12 +165,15 @@ def merge(states: dict[str, State]) -> State:
         common = next((n for n in numbers(state.passes) if _holds(passes, n)), None)
         if common is not None:
             raise StateError(f"{name}: pass {common} is already in the states before it")
+        later = state.passes[-1][1] > max(end for _, end in passes)
+        both = statistics, state.statistics
+        statistics = _merged(*(both if later else reversed(both)))
         passes += state.passes
         arrays = {k: v + state.arrays[k] for k, v in arrays.items()}
-        statistics = _merged(statistics, state.statistics)
         seconds += state.seconds
     ranges = joined(passes)
-    return State(first.identity, first.film, ranges, seconds, statistics, arrays, first.settled)
+    total = State(first.identity, first.film, ranges, seconds, statistics, arrays, first.settled)
+    return replace(total, statistics=statistics | {"relative_error": total.relative_error()})
 
 
 def numbers(passes):
@@ -193,10 +202,12 @@ def describe(passes) -> str:
 
 
 def _merged(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Statistics over the passes of both: counts and seconds add up, everything else is that of
-    ``b``."""
+    """Statistics over the passes of both: counts and seconds add up, they were interrupted if
+    either was, everything else is that of ``b``, which has the last pass."""
     counts = {name: a.get(name, 0) + b.get(name, 0) for name in (*COUNTS, "passes")}
-    return a | b | counts | {"seconds": added(a.get("seconds", {}), b.get("seconds", {}))}
+    seconds = added(a.get("seconds", {}), b.get("seconds", {}))
+    interrupted = a.get("interrupted", False) or b.get("interrupted", False)
+    return a | b | counts | {"seconds": seconds, "interrupted": interrupted}
 
 
 def added(a: dict[str, _N], b: dict[str, _N]) -> dict[str, _N]:

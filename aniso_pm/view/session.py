@@ -18,6 +18,7 @@ import numpy as np
 
 from ..errors import InputError, is_interrupt, one_line
 from ..instruments.explain import explain
+from ..pictures.output import OutputError
 from ..rendering.film import describe
 from .snapshot import Snapshot, status_of
 
@@ -104,9 +105,16 @@ class Session:
         self._state = "stopped" if interrupted else "done"
         if self._integrator.statistics.get("eye_samples"):
             self._statistics = dict(self._integrator.statistics)
-            self._message = "saved: " + ", ".join(str(path) for path in self._save())
+            self._message = self._saved()
         else:
             self._message = "there was nothing to save yet"
+
+    def _saved(self) -> str:
+        """The picture is saved: what was done, or why not. It is shown all the same."""
+        try:
+            return "saved: " + ", ".join(str(path) for path in self._save())
+        except OutputError as error:
+            return f"not saved: {error}; Ctrl-C where it was started tries again"
 
     def _after_pass(self, index, image, statistics) -> None:
         version = (self.snapshot.version if self.snapshot else 0) + 1
@@ -147,7 +155,15 @@ class Session:
             return
         try:
             index = max(0, self._statistics.get("passes", 1) - 1)
-            found = explain(self._world, pixel, self._integrator, self._camera, self._seed, index)
+            found = explain(
+                self._world,
+                pixel,
+                self._integrator,
+                self._camera,
+                self._seed,
+                index,
+                spp=self._spp,
+            )
             answer.set_result(str(found))
         except Exception as error:
             answer.set_exception(error)

@@ -40,6 +40,7 @@ def explain(
     pass_index: int = 0,
     samples: int = 64,
     sample: int | None = None,
+    spp: int = 0,
 ) -> Explanation:
     """Explain what the photon map gives to a pixel, and by which kernel.
 
@@ -52,6 +53,8 @@ def explain(
     samples     eye paths to trace through random points of the pixel.
     sample      number of the one that is shown, from 0; default: the one of median throughput
                 among those that follow a lobe and find photons, if there are any.
+    spp         as for rendering: of all passes, or of each where there is no limit to them; 0 takes
+                those of the sensor's sampler.
 
     Raises ValueError for a pixel outside the film, a sample that is not there, and where the
     integrator refuses the scene.
@@ -67,7 +70,7 @@ def explain(
 
     # --- The photon map of that pass ---
     prepared = prepare(scene, settings, hide_emitters)
-    spp = sample_count(settings, 0, sensor)
+    spp = sample_count(settings, spp, sensor)
     pixels = film.pixel_count(sensor.film())
     each = shares(settings, spp, pixels).each
     settled = settle(prepared, sensor, seed, each)
