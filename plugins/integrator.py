@@ -17,6 +17,7 @@ from aniso_pm.rendering.film import pixel_weights as film_weights
 from aniso_pm.rendering.layered import develop
 from aniso_pm.rendering.pilot import USUAL, automatic_radius
 from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.schedule import with_passes
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.state import Checkpoint
 
@@ -101,12 +102,14 @@ class AnisoPhotonMapper:
      * - passes
        - |int|
        - Number of passes with fresh photons and fresh eye paths; the samples per pixel are the
-         total over all passes, shared evenly. 0 is without limit: passes go on until ``time`` or
-         ``target_error`` ends them, and each takes the samples per pixel that are given (at least
-         8 where only the scene's sampler says how many), but no more than make 524,288 eye samples
-         in all (in large pictures up to four a pixel, while these are no more than 2,097,152),
-         fewer where it has many light paths, and at least one a pixel.
-         (Default: 1, or 0 where ``time`` or ``target_error`` is given)
+         total over all passes, shared evenly. 0 is automatic: as many as make passes of 32 samples
+         per pixel and of 524,288 eye samples at most (in large pictures of up to four a pixel,
+         while these are no more than 2,097,152), for several small photon maps serve better than
+         a large one; at least 16 in spectral variants; one where ``photon_count`` is given.
+         Where ``time`` or ``target_error`` ends rendering, 0 is without limit, and each pass takes
+         the samples per pixel that are given (at least 8 where only the scene's sampler says how
+         many), but no more eye samples than above, fewer where it has many light paths, and at
+         least one a pixel. (Default: 0)
 
      * - time
        - |float|
@@ -219,7 +222,7 @@ class AnisoPhotonMapper:
     ``aniso_pm.distributed``).
 
     In spectral variants all photons and eye paths of a pass share four wavelengths, stratified over
-    the passes: give at least 16 passes.
+    the passes: there should be at least 16.
 
     .. warning:: Participating media, polarized variants and derivatives are refused. The program
        :monosp:`mitsuba` cannot load plugins written in Python; use
@@ -257,8 +260,6 @@ class AnisoPhotonMapper:
                     "samples per pixel say how much is rendered)"
                 )
         given = {f.name: props[f.name] for f in fields(Settings) if f.name in props}
-        if given.get("time") or given.get("target_error"):
-            given.setdefault("passes", 0)
         self.settings = Settings(**given)
         self.statistics: dict[str, Any] = {}
         self.variance: np.ndarray | None = None
@@ -299,7 +300,8 @@ class AnisoPhotonMapper:
             sensor = sensors[int(sensor)]
         self.statistics, self.variance, self._last_map, self.layers = {}, None, None, {}
         with dr.suspend_grad():
-            prepared = prepare(scene, self.settings, self.hide_emitters)
+            settings = with_passes(self.settings, spp, sensor)
+            prepared = prepare(scene, settings, self.hide_emitters)
             so_far = partial(self._so_far, film_weights(sensor.film()))
             controls = Controls(
                 self.first_pass,
@@ -307,6 +309,8 @@ class AnisoPhotonMapper:
                 self.callback,
                 self.checkpoint,
                 so_far,
+                # Costs memory, which nobody expects who has not asked for passes.
+                spread=not self.settings.automatic_passes or "standard_error" in settings.layers,
                 elsewhere=self.elsewhere,
             )
             done = progressive.render(
@@ -366,8 +370,8 @@ class AnisoPhotonMapper:
             self.layers["standard_error"] = np.sqrt(variance[..., :3]).astype(np.float32)
 
     def stop_after(self, passes: int = 0, time: float = 0.0, target_error: float = 0.0) -> None:
-        """Replace the stopping rules by these, whichever comes first; 0 is no limit. Raises
-        ValueError for values out of range, and if there is no rule left."""
+        """Replace the stopping rules by these, whichever comes first; 0 is no limit, and without
+        any the number of passes is automatic. Raises ValueError for values out of range."""
         self.settings = self.settings.with_(passes=passes, time=time, target_error=target_error)
 
     def parameters(self) -> dict[str, Any]:

@@ -245,7 +245,10 @@ def test_layers_and_denoised_picture_are_written_and_merged(run, tmp_path):
     [
         (["--layers", "albedo", "-p", "layers=normal"], ["--layers", "-p layers", "one of them"]),
         (["--save-every", "9", "--integrator", "path"], ["--save-every", "one pass only"]),
-        (["--save-every", "9"], ["--save-every", "a single pass", "--passes"]),
+        (
+            ["--save-every", "9", "-p", "passes=1"],
+            ["--save-every", "a single pass", "--passes"],
+        ),
         (["--layers", "albedo,nothing"], ['no layer "nothing"', "albedo"]),
         (["--bits", "12", "--png"], ["--bits is 12", "8 or 16"]),
         (["--exposure", "1"], ["add --png"]),

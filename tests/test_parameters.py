@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("without_pilot")
         ("photon_count", -5, "between"),
         ("photon_count", 1.5, "integer"),
         ("photon_count", "many", "integer"),
-        ("passes", 0, "between"),
+        ("passes", -1, "between"),
         ("alpha", 0.0, "above 0"),
         ("alpha", 1.5, "at most 1"),
         ("initial_radius", -1.0, "positive"),

@@ -95,13 +95,55 @@ def test_a_rendering_without_end_stops_where_a_pixel_has_no_more_samples(monkeyp
     assert "pass 6 goes beyond sample 100 of a pixel" in plugin.statistics["failure"]
 
 
+@pytest.mark.parametrize(
+    "parameters, spp, size, passes",
+    [
+        ({}, 16, 160 * 120, 1),
+        ({}, 256, 160 * 120, 10),
+        ({}, 256, 64 * 64, 8),
+        ({}, 64, 640 * 480, 16),
+        ({}, 3, 4096 * 4096, 3),
+        ({}, 0, 64 * 64, 2),
+        ({"passes": 1}, 256, 160 * 120, 1),
+        ({"photon_count": 1000}, 256, 160 * 120, 1),
+        ({"photon_count": 1000, "layers": "standard_error"}, 256, 160 * 120, 2),
+        ({"layers": "standard_error"}, 16, 160 * 120, 2),
+        ({"time": 1.0}, 256, 160 * 120, 0),
+    ],
+)
+def test_passes_are_as_many_as_make_them_short(parameters, spp, size, passes, monkeypatch):
+    monkeypatch.setattr(schedule, "pixel_count", lambda film: size)
+    sampler = {"type": "independent", "sample_count": 64}
+    sensor = mi.load_dict({"type": "perspective", "sampler": sampler})
+    assert schedule.with_passes(Settings(**parameters), spp, sensor).passes == passes
+
+
+@pytest.mark.with_pilot
+def test_automatic_passes_leave_one_picture_and_no_variance():
+    plugin = integrator(photon_count=0)
+    image = render(load(16), plugin, 96)
+    s = plugin.statistics
+    assert s["passes"] == 3 and s["photons_emitted"] == 3 * s["photon_count"] and s["spp"] == 96
+    assert plugin.variance is None and plugin.parameters()["passes"] == 0
+    explicit = integrator(photon_count=0, passes=3)
+    close(render(load(16), explicit, 96), image)
+    assert explicit.variance is not None
+
+
+@pytest.mark.with_pilot
+def test_pictures_in_spectral_variants_have_passes_for_their_colours(variant_llvm_spectral):
+    plugin = integrator(photon_count=0)
+    render(load(8), plugin, 32)
+    assert plugin.statistics["passes"] == schedule.SPECTRAL_PASSES
+
+
 @pytest.mark.with_pilot
 def test_automatic_photon_count_grows_with_the_samples_of_a_pass():
     """Not in proportion: every gather meets the photons of all light paths."""
     scene = load(64)
     chosen = {}
     for spp in (64, 256):
-        plugin = integrator(photon_count=0)
+        plugin = integrator(photon_count=0, passes=1)
         render(scene, plugin, spp)
         s = plugin.statistics
         assert s["photon_count_automatic"] and s["photon_count"] == s["photons_emitted"]

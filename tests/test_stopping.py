@@ -11,7 +11,7 @@ import pytest
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.state import Checkpoint
 from aniso_pm.rendering.stopping import Stopping
-from passes import SMALL, integrator, load, render
+from passes import integrator, load, render
 from rooms import room
 
 pytestmark = pytest.mark.usefixtures("without_pilot")
@@ -92,14 +92,14 @@ def test_nothing_to_see_reaches_any_target():
     assert plugin.statistics["passes"] == 4
 
 
-def test_passes_without_any_end_are_refused():
-    with pytest.raises(Exception, match='"passes" is 0.*"time" or "target_error"'):
-        mi.load_dict(SMALL | {"passes": 0})
+def test_stopping_rules_replace_each_other():
     plugin = integrator(passes=3)
     plugin.stop_after(time=2.0)
     assert plugin.parameters()["passes"] == 0 and plugin.parameters()["time"] == 2
+    plugin.stop_after()
+    assert plugin.settings.automatic_passes
     with pytest.raises(ValueError, match="passes"):
-        plugin.stop_after()
+        plugin.stop_after(passes=-1)
 
 
 @pytest.mark.slow

@@ -142,7 +142,7 @@ def test_work_that_a_plan_counts_is_what_passes_do(variant_llvm_rgb, monkeypatch
         return plans[-1][0]
 
     monkeypatch.setattr(plan.Plan, "_of", staticmethod(watched))
-    plugin = mi.load_dict({"type": "aniso_pm", "map": use, "kernel": "isotropic"})
+    plugin = mi.load_dict({"type": "aniso_pm", "map": use, "kernel": "isotropic", "passes": 1})
     mi.render(scene, integrator=plugin, spp=64)
     found, given = plans[-1]
     s = plugin.statistics

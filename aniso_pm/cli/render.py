@@ -184,6 +184,7 @@ def render(
                 task_limit=task_limit,
                 # As often as the picture is saved.
                 home_every=max(save_every, 1.0),
+                passes=_passes(integrator, spp, camera),
             ):
                 _render(world, camera, integrator, seed, spp, quiet)
             record = write()
@@ -320,14 +321,25 @@ def _prepare_passes(
         except ValueError as error:
             raise InputError(one_line(error)) from error
     integrator.first_pass = first_pass
-    if keep_state or integrator.settings.passes != 1:
+    settings = integrator.settings
+    if keep_state or settings.passes > 1 or settings.open_ended:
         return keep_state
+    if settings.automatic_passes and save_every is not None:
+        return False
     if save_every is not None:
         raise InputError(
             "--save-every: a single pass is saved at its end; give --passes, --time or "
             "--target-error"
         )
     return None
+
+
+def _passes(integrator, spp: int | None, camera) -> int:
+    """That will be rendered, 0 without end."""
+    from aniso_pm.rendering.schedule import with_passes
+
+    settings = getattr(integrator, "settings", None)
+    return with_passes(settings, spp or 0, camera).passes if settings else 1
 
 
 def _ask_for_layers(integrator, layers: str | None, denoise: bool) -> None:

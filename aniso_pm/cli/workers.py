@@ -59,10 +59,12 @@ def rendering_elsewhere(
     task_seconds: float | None,
     task_limit: float | None,
     home_every: float,
+    passes: int,
 ) -> Iterator[None]:
     """Let ``integrator`` render on workers inside the block, if they are asked for.
 
-    mixed, task_seconds, task_limit, home_every: of ``distributed.Options``.
+    mixed, task_seconds, task_limit, home_every: of ``distributed.Options``. passes: that it will
+    render, 0 without end.
     """
     ways = {"--workers": workers, "--scheduler": scheduler, "--scheduler-file": scheduler_file}
     asked = [name for name, value in ways.items() if value]
@@ -85,7 +87,7 @@ def rendering_elsewhere(
     require()
     from aniso_pm.distributed import Elsewhere, Options, Parcel
 
-    if integrator.settings.passes == 1:
+    if passes == 1:
         warn(f"{asked[0]}: a single pass is one worker's work; give --passes, or --time")
     parcel = Parcel.of(scene, defines)
     if workers:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -13,7 +13,7 @@ from ..rendering.history import recorded
 from ..rendering.needs import emitter_name
 from ..rendering.pilot import camera_rays, settle
 from ..rendering.prepared import Prepared
-from ..rendering.schedule import sample_count, shares
+from ..rendering.schedule import sample_count, shares, with_passes
 
 
 @dataclass(frozen=True)
@@ -217,6 +217,7 @@ def decided(scene: Prepared, spp: int = 0) -> tuple[Prepared, list[str], str, fl
         causes = ["nothing casts caustics"] if scene.settings.map == "auto" else []
         return scene, [f"map=auto: {cause}" for cause in causes], "there are no light paths", 0.0
     sensor = scene.scene.sensors()[0]
+    scene = replace(scene, settings=with_passes(scene.settings, spp, sensor))
     spp, pixels = sample_count(scene.settings, spp, sensor), pixel_count(sensor.film())
     found = settle(scene, sensor, 0, shares(scene.settings, spp, pixels).each)
     why = []

@@ -9,9 +9,8 @@ import mitsuba as mi
 
 from .pilot import LARGEST
 from .prepared import Prepared
+from .schedule import SPECTRAL_PASSES
 
-# Passes that make the colours of a spectral picture right within about a percent.
-_SPECTRAL_PASSES = 16
 # Anisotropic meshes without texture coordinates that warnings name.
 _NAMED = 3
 # Photons in the mean kernel below which a radius that was given cannot be meant.
@@ -38,12 +37,12 @@ def before(scene: Prepared) -> None:
     _ray_offset(scene)
     _large_radius(scene)
     passes = scene.settings.passes
-    if mi.is_spectral and 0 < passes < _SPECTRAL_PASSES:
+    if mi.is_spectral and 0 < passes < SPECTRAL_PASSES:
         few = f"{passes} passes" if passes > 1 else "one pass"
         mi.Log(
             mi.LogLevel.Warn,
             f"aniso_pm: all light of a pass shares four wavelengths; {few} will give "
-            f'wrong colours, set the parameter "passes" to {_SPECTRAL_PASSES} or more',
+            f'wrong colours, set the parameter "passes" to {SPECTRAL_PASSES} or more',
         )
 
 

@@ -117,7 +117,7 @@ def decide(
     # --- What follows ---
     # Variances are worth their memory where there can be any, now or after a merge.
     kept = controls.checkpoint is not None or controls.settled is not None
-    variance = kept or settings.passes != 1
+    variance = kept or (controls.spread and settings.passes != 1)
     wavefronts = memory.fitting(scene, *_job(scene, film, seed, share, layered, variance))
     scene = replace(scene, light_wavefront=wavefronts.light_paths)
     if not settings.initial_radius:

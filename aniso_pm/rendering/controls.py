@@ -29,6 +29,7 @@ class Controls:
     so_far      called as so_far(variance, layers, passes), as in ``Rendered``, before somebody else
                 looks at the picture so far.
     settled     what a pilot has chosen, on another machine; None: one will choose here.
+    spread      is the spread of passes kept, where there are several?
     elsewhere   who renders the passes, if not this process: called with the ``Run``, gives them to
                 its ``add``. progress and callback are then called after each of those.
     """
@@ -39,6 +40,7 @@ class Controls:
     checkpoint: Checkpoint | None = None
     so_far: Callable[[Any, Any, int], None] | None = None
     settled: Settled | None = None
+    spread: bool = True
     elsewhere: Callable[[Run], None] | None = None
 
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import mitsuba as mi
+
 from .allotment import FEW, MOST
+from .film import pixel_count
 from .prepared import COLOUR, stream_seed
 from .settings import Settings
 
@@ -17,6 +20,10 @@ LARGEST = int(2**32 / MOST)
 # Samples per pixel of such a pass where nobody but the scene's sampler says how many: that of
 # Mitsuba takes 4 by itself, and passes so small have up to half again the error after a time.
 _SEVERAL = 8
+# Samples per pixel of a pass at most, where the number of passes is automatic.
+_SHORT = 32
+# Passes that make the colours of a spectral picture right within about a percent.
+SPECTRAL_PASSES = 16
 
 
 def bandwidth(initial_radius: float, alpha: float, index: int) -> float:
@@ -52,7 +59,32 @@ def sample_count(settings: Settings, spp: int, sensor) -> int:
     if spp:
         return spp
     count = sensor.sampler().sample_count()
-    return count if settings.passes else max(count, _SEVERAL)
+    return max(count, _SEVERAL) if settings.endless else count
+
+
+def with_passes(settings: Settings, spp: int, sensor) -> Settings:
+    """The settings with a number of passes, where it is automatic: one where a number of light
+    paths is given for it; else as many as make them as short as those of open end, and no longer
+    than _SHORT samples per pixel. Photons of a pass are met by all of its gathers: of several
+    passes each has fewer, for the same noise of their mean. At least two where their spread is
+    asked for, and SPECTRAL_PASSES in spectral variants, if there are so many samples.
+
+    spp  as for ``sample_count``.
+    """
+    if not settings.automatic_passes:
+        return settings
+    count = sample_count(settings, spp, sensor)
+    passes = 2 if "standard_error" in settings.layer_names else 1
+    if not settings.photon_count:
+        passes = max(passes, -(-count // min(_SHORT, _most(pixel_count(sensor.film())))))
+        if mi.is_spectral:
+            passes = max(passes, SPECTRAL_PASSES)
+    return settings.with_(passes=max(min(passes, count), 1))
+
+
+def _most(pixels: int) -> int:
+    """Samples per pixel of a pass of open end."""
+    return max(1, OPEN_PASS // pixels, min(FEW, LARGE_PASS // pixels))
 
 
 def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Shares:
@@ -66,8 +98,7 @@ def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Sh
     """
     passes = settings.passes
     if passes == 0:
-        most = max(1, OPEN_PASS // pixels, min(FEW, LARGE_PASS // pixels))
-        each, rest = min(spp, most), 0
+        each, rest = min(spp, _most(pixels)), 0
     elif spp >= passes:
         each, rest = divmod(spp, passes)
     elif settings.open_ended:

@@ -28,7 +28,7 @@ class Settings:
     final_gather: bool = False
     gather_roughness: float = 0.2
     photon_count: int = 0
-    passes: int = 1
+    passes: int = 0
     time: float = 0.0
     target_error: float = 0.0
     alpha: float = 2 / 3
@@ -71,9 +71,7 @@ class Settings:
         self._between(
             "target_error", 0, 1e3, "0 (no target) or a positive relative error of up to 1000"
         )
-        endless = self.passes == 0 and not self.open_ended
-        words = 'between 1 and 1e+07, or 0 (no limit) where "time" or "target_error" is given'
-        self._between("passes", 0, 10**7, words, not endless)
+        self._between("passes", 0, 10**7, "between 1 and 1e+07, or 0 (automatic)")
         self._between("alpha", 0, 1, "above 0 and at most 1", self.alpha > 0)
         self._between(
             "initial_radius", 0, 1e30, "0 (automatic) or a positive length of up to 1e+30"
@@ -114,6 +112,16 @@ class Settings:
     def open_ended(self) -> bool:
         """May rendering end before the last pass, by time or error?"""
         return self.time > 0 or self.target_error > 0
+
+    @property
+    def endless(self) -> bool:
+        """Is there no limit to the number of passes?"""
+        return self.passes == 0 and self.open_ended
+
+    @property
+    def automatic_passes(self) -> bool:
+        """Does their number follow from the samples (``schedule.with_passes``)?"""
+        return self.passes == 0 and not self.open_ended
 
     @property
     def depth_limit(self) -> int:

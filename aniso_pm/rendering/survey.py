@@ -177,7 +177,7 @@ def decide(
     light_paths  of a pass if they are given, else 0 or None.
     """
     tiles = seen.tiles
-    longest = math.inf if scene.settings.passes else _LONGEST
+    longest = _LONGEST if scene.settings.endless else math.inf
     # What uses are compared after: the work of path tracing, whatever the length of their passes.
     total = PASSES * each * tiles.pixels * float(seen.work.mean())
     plan_of = partial(

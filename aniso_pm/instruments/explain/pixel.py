@@ -17,7 +17,13 @@ from ...rendering import film, footprint, gathering
 from ...rendering.needs import describe, surfaces
 from ...rendering.pilot import settle
 from ...rendering.prepared import EYE, PROBE, Prepared, prepare, stream_seed
-from ...rendering.schedule import bandwidth, sample_count, shares, wavelength_sample
+from ...rendering.schedule import (
+    bandwidth,
+    sample_count,
+    shares,
+    wavelength_sample,
+    with_passes,
+)
 from ...rendering.settings import Settings
 from .explanation import Explanation
 from .record import Kernel, Lobe, Photons, Vertex
@@ -65,7 +71,7 @@ def explain(
     if sample is not None and not 0 <= sample < samples:
         raise ValueError(f"explain: sample {sample} is not one of 0 to {samples - 1}")
     integrator = integrator or scene.integrator()
-    settings = getattr(integrator, "settings", None) or Settings()
+    settings = with_passes(getattr(integrator, "settings", None) or Settings(), spp, sensor)
     hide_emitters = bool(getattr(integrator, "hide_emitters", False))
 
     # --- The photon map of that pass ---
