@@ -108,7 +108,7 @@ class AnisoPhotonMapper:
          a large one; at least 16 in spectral variants; one where ``photon_count`` is given.
          Where ``time`` or ``target_error`` ends rendering, 0 is without limit, and each pass takes
          the samples per pixel that are given (at least 8 where only the scene's sampler says how
-         many), but no more eye samples than above, fewer where it has many light paths, and at
+         many), but no more than above, fewer where it has many light paths, and at
          least one a pixel. (Default: 0)
 
      * - time

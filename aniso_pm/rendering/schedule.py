@@ -20,7 +20,7 @@ LARGEST = int(2**32 / MOST)
 # Samples per pixel of such a pass where nobody but the scene's sampler says how many: that of
 # Mitsuba takes 4 by itself, and passes so small have up to half again the error after a time.
 _SEVERAL = 8
-# Samples per pixel of a pass at most, where the number of passes is automatic.
+# The most that they take in small pictures.
 _SHORT = 32
 # Passes that make the colours of a spectral picture right within about a percent.
 SPECTRAL_PASSES = 16
@@ -64,10 +64,9 @@ def sample_count(settings: Settings, spp: int, sensor) -> int:
 
 def with_passes(settings: Settings, spp: int, sensor) -> Settings:
     """The settings with a number of passes, where it is automatic: one where a number of light
-    paths is given for it; else as many as make them as short as those of open end, and no longer
-    than _SHORT samples per pixel. Photons of a pass are met by all of its gathers: of several
-    passes each has fewer, for the same noise of their mean. At least two where their spread is
-    asked for, and SPECTRAL_PASSES in spectral variants, if there are so many samples.
+    paths is given for it; else as many as make them as short as those of open end. At least two
+    where their spread is asked for, and SPECTRAL_PASSES in spectral variants, if there are so many
+    samples.
 
     spp  as for ``sample_count``.
     """
@@ -76,23 +75,24 @@ def with_passes(settings: Settings, spp: int, sensor) -> Settings:
     count = sample_count(settings, spp, sensor)
     passes = 2 if "standard_error" in settings.layer_names else 1
     if not settings.photon_count:
-        passes = max(passes, -(-count // min(_SHORT, _most(pixel_count(sensor.film())))))
+        passes = max(passes, -(-count // _most(pixel_count(sensor.film()))))
         if mi.is_spectral:
             passes = max(passes, SPECTRAL_PASSES)
     return settings.with_(passes=max(min(passes, count), 1))
 
 
 def _most(pixels: int) -> int:
-    """Samples per pixel of a pass of open end."""
-    return max(1, OPEN_PASS // pixels, min(FEW, LARGE_PASS // pixels))
+    """Samples per pixel of a pass. All of its gathers meet all of its photons; of several passes
+    each has fewer, for the same noise of their mean."""
+    return max(1, min(_SHORT, OPEN_PASS // pixels), min(FEW, LARGE_PASS // pixels))
 
 
 def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Shares:
     """How the passes share ``spp`` samples per pixel.
 
     With a fixed number of passes ``spp`` is the total, shared evenly. With ``passes = 0`` a pass
-    takes ``spp`` samples, but no more than make OPEN_PASS eye samples in all, or FEW a pixel if
-    that is within LARGE_PASS, and at least one.
+    takes ``spp`` samples, but no more than _SHORT a pixel, and no more than make OPEN_PASS eye
+    samples in all, or FEW a pixel if that is within LARGE_PASS, and at least one.
 
     Raises ValueError if there are fewer samples than passes, unless time or error may end them.
     """
