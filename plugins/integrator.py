@@ -103,9 +103,10 @@ class AnisoPhotonMapper:
        - |int|
        - Number of passes with fresh photons and fresh eye paths; the samples per pixel are the
          total over all passes, shared evenly. 0 is automatic: as many as make passes of 32 samples
-         per pixel and of 524,288 eye samples at most (in large pictures of up to four a pixel,
-         while these are no more than 2,097,152), for several small photon maps serve better than
-         a large one; at least 16 in spectral variants; one where ``photon_count`` is given.
+         per pixel (below 64 × 64 pixels of 131,072 eye samples) and of 524,288 eye samples at most
+         (in large pictures of up to four a pixel, while these are no more than 2,097,152), for
+         several small photon maps serve better than a large one; at least 16 in spectral variants;
+         one where ``photon_count`` is given.
          Where ``time`` or ``target_error`` ends rendering, 0 is without limit, and each pass takes
          the samples per pixel that are given (at least 8 where only the scene's sampler says how
          many), but no more than above, fewer where it has many light paths, and at
@@ -309,8 +310,7 @@ class AnisoPhotonMapper:
                 self.callback,
                 self.checkpoint,
                 so_far,
-                # Costs memory, which nobody expects who has not asked for passes.
-                spread=not self.settings.automatic_passes or "standard_error" in settings.layers,
+                spread=self.settings.wants_spread,
                 elsewhere=self.elsewhere,
             )
             done = progressive.render(

@@ -20,8 +20,9 @@ LARGEST = int(2**32 / MOST)
 # Samples per pixel of such a pass where nobody but the scene's sampler says how many: that of
 # Mitsuba takes 4 by itself, and passes so small have up to half again the error after a time.
 _SEVERAL = 8
-# The most that they take in small pictures.
-_SHORT = 32
+# The most that they take in small pictures, unless these are so small that a pass would not have
+# even so many eye samples: what it costs besides would count most.
+_SHORT, SMALL_PASS = 32, 1 << 17
 # Passes that make the colours of a spectral picture right within about a percent.
 SPECTRAL_PASSES = 16
 
@@ -84,15 +85,16 @@ def with_passes(settings: Settings, spp: int, sensor) -> Settings:
 def _most(pixels: int) -> int:
     """Samples per pixel of a pass. All of its gathers meet all of its photons; of several passes
     each has fewer, for the same noise of their mean."""
-    return max(1, min(_SHORT, OPEN_PASS // pixels), min(FEW, LARGE_PASS // pixels))
+    short = max(_SHORT, SMALL_PASS // pixels)
+    return max(1, min(short, OPEN_PASS // pixels), min(FEW, LARGE_PASS // pixels))
 
 
 def shares(settings: Settings, spp: int, pixels: int, first_pass: int = 0) -> Shares:
     """How the passes share ``spp`` samples per pixel.
 
     With a fixed number of passes ``spp`` is the total, shared evenly. With ``passes = 0`` a pass
-    takes ``spp`` samples, but no more than _SHORT a pixel, and no more than make OPEN_PASS eye
-    samples in all, or FEW a pixel if that is within LARGE_PASS, and at least one.
+    takes ``spp`` samples, but no more than _SHORT a pixel or make SMALL_PASS eye samples in all, no
+    more than make OPEN_PASS, or FEW a pixel if that is within LARGE_PASS, and at least one.
 
     Raises ValueError if there are fewer samples than passes, unless time or error may end them.
     """

@@ -124,6 +124,12 @@ class Settings:
         return self.passes == 0 and not self.open_ended
 
     @property
+    def wants_spread(self) -> bool:
+        """Is the variance of the picture kept? It takes memory, which nobody expects who has not
+        asked for passes."""
+        return not self.automatic_passes or "standard_error" in self.layer_names
+
+    @property
     def depth_limit(self) -> int:
         """Path segments of a whole light path, a large number where there is no limit."""
         return _UNLIMITED if self.max_depth == -1 else self.max_depth
