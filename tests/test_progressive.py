@@ -122,12 +122,12 @@ def test_passes_are_as_many_as_make_them_short(parameters, spp, size, passes, mo
 @pytest.mark.with_pilot
 def test_automatic_passes_leave_one_picture_and_no_variance():
     plugin = integrator(photon_count=0)
-    image = render(load(16), plugin, 96)
+    image = render(load(64), plugin, 96)
     s = plugin.statistics
     assert s["passes"] == 3 and s["photons_emitted"] == 3 * s["photon_count"] and s["spp"] == 96
     assert plugin.variance is None and plugin.parameters()["passes"] == 0
     explicit = integrator(photon_count=0, passes=3)
-    close(render(load(16), explicit, 96), image)
+    close(render(load(64), explicit, 96), image)
     assert explicit.variance is not None
 
 
