@@ -58,6 +58,16 @@ def lamp(size=0.5, height=2.0):
     }
 
 
+def bright_wall():
+    """Beside a floor around the origin: what its indirect light comes from."""
+    T = mi.ScalarTransform4f
+    return {
+        "type": "rectangle",
+        "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90),
+        "bsdf": {"type": "diffuse", "reflectance": 0.9},
+    }
+
+
 def looking_down(offset=0.0, fov=20):
     T = mi.ScalarTransform4f
     return {
@@ -139,7 +149,6 @@ def test_what_lies_on_a_floor_does_not_darken_it(thickness, bsdf):
     """Kernels of the floor beside a sheet or a coin, mirrored or not, reach under it, where no
     photons are."""
     T = mi.ScalarTransform4f
-    wall = T().translate([0, 1, 1]).rotate([1, 0, 0], 90)
     flat = T().translate([0, 0, 0.001]).scale(0.3)
     thick = T().translate([0, 0, abs(thickness) / 2]).scale([0.3, 0.3, thickness / 2])
     definition = {
@@ -147,11 +156,7 @@ def test_what_lies_on_a_floor_does_not_darken_it(thickness, bsdf):
         "sensor": looking_down(offset=0.38, fov=2.5),
         "light": {"type": "point", "position": [0.3, 0.5, 1.5]},
         "floor": {"type": "rectangle"},
-        "wall": {
-            "type": "rectangle",
-            "to_world": wall,
-            "bsdf": {"type": "diffuse", "reflectance": 0.9},
-        },
+        "wall": bright_wall(),
         "thing": {
             "type": "cube" if thickness else "rectangle",
             "to_world": thick if thickness else flat,
@@ -177,11 +182,7 @@ def test_a_floor_ends_where_a_pane_begins(bsdf):
             "to_world": T().translate([1, 0, 0]),
             "bsdf": {"type": bsdf},
         },
-        "wall": {
-            "type": "rectangle",
-            "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90),
-            "bsdf": {"type": "diffuse", "reflectance": 0.9},
-        },
+        "wall": bright_wall(),
     }
     found, error = ratio(definition, 0.15)
     print(found, error)
@@ -206,11 +207,7 @@ def test_kernels_of_rough_texels_reach_over_smooth_ones():
             "type": "rectangle",
             "bsdf": {"type": "twosided", "b": {"type": "roughconductor", "alpha": chequers}},
         },
-        "wall": {
-            "type": "rectangle",
-            "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90),
-            "bsdf": {"type": "diffuse", "reflectance": 0.9},
-        },
+        "wall": bright_wall(),
     }
     found, error = ratio(definition, 0.15)
     print(found, error)

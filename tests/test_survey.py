@@ -261,6 +261,7 @@ def test_a_map_thinned_holds_some_of_the_light_paths(variant_llvm_rgb):
     flux = [photon_flux(*each, True).numpy() for each in zip((whole, part), slots, strict=True)]
     assert flux[1].sum() == pytest.approx(flux[0][:, kept].sum(), rel=1e-5)
     assert thinned(whole, 4000) is whole
+    assert thinned(replace(whole, sums="of another index"), 1000).sums is None
 
 
 def test_a_pilot_looks_at_photons_one_by_one(variant_llvm_rgb):

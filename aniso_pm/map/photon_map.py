@@ -117,8 +117,9 @@ def _part(map_: PhotonMap, slot, emitted: int) -> PhotonMap:
         None if map_.origins is None else dr.gather(mi.UInt32, map_.origins.path, slot),
     )
     dr.eval(photons)
-    nothing = replace(map_, emitted=emitted, stored=0, index=None, flux=None, direction=None)
-    nothing = replace(nothing, sums=None)  # those were of another index
+    nothing = replace(
+        map_, emitted=emitted, stored=0, index=None, flux=None, direction=None, sums=None
+    )
     return indexed(photons, dr.width(slot), nothing)
 
 
