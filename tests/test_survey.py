@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from aniso_pm.instruments import gallery
 from aniso_pm.map.photon_map import photon_flux, thinned
-from aniso_pm.rendering import pilot, plan, survey
+from aniso_pm.rendering import pilot, plan, reading, survey
 from aniso_pm.rendering.decisions import WORTH_FOLLOWING
 from aniso_pm.rendering.film import border
 from aniso_pm.rendering.prepared import prepare
@@ -244,7 +244,7 @@ def test_work_is_counted_once_where_gather_points_need_more_room(variant_llvm_rg
 )
 def test_gathers_that_ask_a_bsdf_are_dearer(variant_llvm_rgb, lambertian, times):
     points = SimpleNamespace(lambertian=None if lambertian is None else mi.Bool(lambertian))
-    assert survey._dearer(points, 3.0) == pytest.approx(times)
+    assert reading.dearer(points, 3.0) == pytest.approx(times)
 
 
 def test_a_map_thinned_holds_some_of_the_light_paths(variant_llvm_rgb):
@@ -276,19 +276,19 @@ def test_a_pilot_looks_at_photons_one_by_one(variant_llvm_rgb):
 def test_a_pilot_gathers_no_more_where_photons_lie_close(variant_llvm_rgb, monkeypatch):
     """In a room with the light inside, kernels of eight pixels of a small picture hold hundreds."""
     met = []
-    gathered = survey._gathered
+    gathered = reading.Reader._gathered
 
-    def watched(*given):
-        found = gathered(*given)
-        met.append(found[2].mean() * given[5])
+    def watched(reader, *given):
+        found = gathered(reader, *given)
+        met.append(found[2].mean() * reader.lanes)
         return found
 
-    monkeypatch.setattr(survey, "_gathered", watched)
+    monkeypatch.setattr(reading.Reader, "_gathered", watched)
     found, _ = settled(room_with_ball(size=128), map="global")
     few, *all_ = met
-    assert survey._ASKED * few > 4 * survey._MET_BY_ALL  # or there is nothing to leave out
-    assert len(all_) == 4 and max(all_) < 1.5 * survey._MET_BY_ALL
-    monkeypatch.setattr(survey, "_MET_BY_ALL", 1e9)
+    assert reading._ASKED * few > 4 * reading._MET_BY_ALL  # or there is nothing to leave out
+    assert len(all_) == 4 and max(all_) < 1.5 * reading._MET_BY_ALL
+    monkeypatch.setattr(reading, "_MET_BY_ALL", 1e9)
     more, _ = settled(room_with_ball(size=128), map="global")
     # They tell the same, but for widths: where they are less certain kernels are narrower, meet
     # fewer photons, and are worth more of them.

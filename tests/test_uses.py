@@ -1,5 +1,6 @@
 """``map=auto``: the pilot chooses the use of least error, and never one that loses light."""
 
+import math
 from dataclasses import replace
 
 import aniso_pm  # noqa: F401
@@ -7,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aniso_pm.rendering import pilot
+from aniso_pm.rendering import pilot, survey
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
 from aniso_pm.rendering.tiles import Tiles
@@ -53,11 +54,31 @@ def settled(definition, **settings):
     return pilot.settle(prepared, scene.sensors()[0], 0, 16), prepared
 
 
-def test_what_path_tracing_does_well_is_path_traced(variant_llvm_rgb):
-    found, prepared = settled(ball(SKY, PLASTIC, 64))
-    assert prepared.undecided
-    assert found.use == "none"
-    assert found.errors["none"] < found.errors["global"]
+def test_what_path_tracing_does_well_is_path_traced(variant_llvm_rgb, monkeypatch):
+    """Also where no map is read, because even photons without noise or cost would gain little."""
+    promised = []
+    for close in (survey._CLOSE, 0):
+        monkeypatch.setattr(survey, "_CLOSE", close)
+        found, prepared = settled(ball(SKY, PLASTIC, 64))
+        assert prepared.undecided
+        assert found.use == "none"
+        promised.append(found.errors)
+    at_once, compared = promised
+    assert list(at_once) == ["none"]
+    assert at_once["none"] == pytest.approx(compared["none"], rel=0.05)
+    assert compared["none"] < compared["global"]
+
+
+def test_maps_are_read_where_eye_paths_may_have_missed_caustics(variant_llvm_rgb, monkeypatch):
+    """However good path tracing looks."""
+    monkeypatch.setattr(survey, "_CLOSE", math.inf)
+    asked = []
+    monkeypatch.setattr(survey, "_doubt", lambda *given: asked.append(given))
+    found, _ = settled(ball(SKY, PLASTIC, 64))
+    assert found.use != "none" and found.errors["none"] is None
+    at_once, compared = asked
+    # The light of caustics that the decision goes by is that of the map.
+    assert at_once[1].mean() == pytest.approx(compared[1].mean(), rel=0.1)
 
 
 @pytest.mark.parametrize("bsdf", [PLASTIC, GLASS], ids=["plastic", "glass"])

@@ -243,11 +243,12 @@ def as_promises(errors: dict[str, float | None]) -> str:
     """What a pilot promises of each use of the map, in words."""
     if not errors:
         return "a pilot found no photon to gather"
+    why = "; photons could not lessen it by much" if list(errors) == ["none"] else ""
     words = [
         f"{use} {'finds too little of the caustics' if error is None else f'{error:.1e}'}"
         for use, error in errors.items()
     ]
-    return f"relative MSE that a pilot promises: {', '.join(words)}"
+    return f"relative MSE that a pilot promises: {', '.join(words)}{why}"
 
 
 def as_text(findings: list[Finding]) -> str:

@@ -12,7 +12,8 @@ path tracing and tell apart what each use leaves to them (see ``survey_parts``).
 is chosen, its error after the work of M passes of path tracing, C_0 for each path. Path tracing
 finds some caustics by rare hits that a pilot may miss, so that their variance seems small; it is
 chosen only where it has found the caustics that the map holds, their variance taken to be the
-larger the fewer hits they were, or where these are next to none.
+larger the fewer hits they were, or where these are next to none. What the other uses leave to eye
+paths bounds their errors from below: where path tracing comes close to that, no map is read.
 """
 
 from __future__ import annotations
@@ -27,9 +28,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import arrays
 from ..map.gather_points import take
-from ..map.photon_map import PhotonMap, caustics, thinned
+from ..map.photon_map import PhotonMap, caustics
 from ..map.spectra import channel_mean
 from ..transport import aim
 from ..transport.survey_parts import Parts
@@ -37,43 +37,31 @@ from ..transport.thinning import Thinning
 from ..transport.uses import Use
 from . import footprint
 from .allotment import FEW
-from .film import noise_share, rays_through, wavelengths
-from .plan import (
-    LEAST_SHARE,
-    LEFT,
-    LIGHT_PATH,
-    NARROW,
-    PASSES,
-    STRATIFIED,
-    WIDE,
-    Found,
-    Plan,
-    within,
-)
+from .film import noise_share, rays_through
+from .plan import LEAST_SHARE, PASSES, STRATIFIED, Found, Plan, within
 from .prepared import PILOT, PILOT_FINE, PILOT_PAIRS, Prepared, stream_seed
+from .reading import Reader, dearer, pairwise
 from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
 
 # Work of an eye path: of its first ray, of a vertex.
 _CAMERA, _VERTEX = 0.3, 0.4
 # The same vertices of paths that go on after they have left gather points.
 _GOING_ON = 1.15
-# Work where receivers are not Lambertian, so many times that where they are: of gathers, each
-# photon of which asks the BSDF, and of eye paths, which tell its parts apart.
-_ASKS_GATHER, _ASKS_PATH = 2.0, 1.5
+# Work of eye paths where receivers are not Lambertian, whose parts they tell apart, so many times
+# that where they are.
+_ASKS = 1.5
 # Work of a pass that is not to be exceeded where passes may have any length (see ``Plan.of``): a
 # third of a second.
 _LONGEST = 1.5e6
-# Photons that a map shows to the widest kernels of all pairs, at the most: more of them take longer
-# and tell nothing new. One gather point in so many is asked how many there would be.
-_MET_BY_ALL, _ASKED = 2e6, 16
-# Light paths of a map that are left at least.
-_FEWEST = 2000
 # The caustic map has to promise an error smaller than the global one by so much.
 _BETTER = 0.9
 # Path tracing has found the caustics if it has so much of their light, by as many hits, or if they
 # are less than such a share of the picture's light. With fewer than the last number of hits their
 # variance is taken to be larger than it looks.
 _FOUND, _FEWEST_HITS, _NOTHING, _HITS = 0.7, 8, 1e-4, 64
+# Path tracing comes close where it promises so many times the error that is left to eye paths, at
+# the most: with what photons cost, and with their noise, errors were 1.9 to 50 times as large.
+_CLOSE = 1.5
 
 
 @dataclass(frozen=True)
@@ -151,9 +139,9 @@ def look(scene: Prepared, sensor, seed: int) -> Seen:
     if isinstance(L, Parts):
         L, later, caustic = L.radiance, L.later, L.caustic
     none = dr.zeros(mi.Float, tiles.lanes)
-    later, caustic = _pairwise(later + none), _pairwise(caustic + none)
-    own = _pairwise(channel_mean(L) + none) - later
-    work, early = (_VERTEX * _pairwise(v).mean(1) + _CAMERA for v in (vertices, early))
+    later, caustic = pairwise(later + none), pairwise(caustic + none)
+    own = pairwise(channel_mean(L) + none) - later
+    work, early = (_VERTEX * pairwise(v).mean(1) + _CAMERA for v in (vertices, early))
     return Seen(own, later, caustic, work, early, points, tiles)
 
 
@@ -191,8 +179,8 @@ def decide(
         total=total,
         whole=seen.work,
     )
-    read = partial(_read, scene, sensor, radius, seed, tiles)
-    pilot = _Pilot(scene, sensor, seed, seen, maps, read, plan_of)
+    reader = Reader(scene, sensor, radius, seed, tiles.lanes)
+    pilot = _Pilot(scene, sensor, seed, seen, maps, reader, plan_of)
     if seen.points is None or not min(map_.stored for map_ in maps):
         return pilot.nothing_to_read()
     return pilot.best_use() if scene.use == "survey" else pilot.given_use()
@@ -203,7 +191,7 @@ class _Pilot:
     """What was seen, and how plans follow from it.
 
     scene, sensor, seed, seen, maps  as for ``decide``.
-    read     ``_read`` of these, a function of maps, points and weigh.
+    reader   of photon maps where the pairs gather.
     plan_of  ``Plan.of`` with what is the same for every use.
     """
 
@@ -212,7 +200,7 @@ class _Pilot:
     seed: int
     seen: Seen
     maps: Any
-    read: Callable[..., Found]
+    reader: Reader
     plan_of: Callable[..., Plan]
 
     def nothing_to_read(self) -> Survey:
@@ -234,9 +222,11 @@ class _Pilot:
     def best_use(self) -> Survey:
         """That which promises the least error."""
         seen = self.seen
+        if self.scene.photons_are_dispensable and (plan := self._without_reading()):
+            return self._survey(plan, {"none": plan.error}, None, None)
         first = take(seen.points, dr.compress(~seen.points.later))
         found, plan_of, weight = self._of_reading(first)
-        asks = _dearer(seen.points, _ASKS_PATH)
+        asks = dearer(seen.points, _ASKS)
         best = plan_of(use="global", found=found, work=asks * seen.early)
         errors: dict[str, float | None] = {"global": best.error}
         read: tuple[Any, Any] = self.maps[0], first
@@ -247,7 +237,7 @@ class _Pilot:
         if plan_of(use="none", later=later).error >= best.error:
             return self._survey(best, errors, *read)
         maps = [caustics(map_) for map_ in self.maps]
-        found = self.read(maps, seen.points, lambda _: weight)
+        found = self.reader.found(maps, seen.points, lambda _: weight)
         work = _GOING_ON * asks * seen.work
         plan = plan_of(use="caustic", found=found, later=later, work=work)
         errors["caustic"] = plan.error
@@ -265,10 +255,27 @@ class _Pilot:
                     best, read = plan, (None, None)
         return self._survey(best, errors, *read)
 
+    def _without_reading(self) -> Plan | None:
+        """Path tracing, if photons could not better it by much were there no end of them, and were
+        they free."""
+        seen, asks = self.seen, dearer(self.seen.points, _ASKS)
+        light = seen.own + seen.later
+        all_ = light + seen.caustic
+        weight = seen.tiles.weight(all_)
+        own, going_on, whole = (within(v, v, weight) for v in (seen.own, light, all_))
+        plan_of = partial(self.plan_of, weight=weight, v_own=own)
+        caustic = plan_of(use="caustic", work=_GOING_ON * asks * seen.work, later=going_on - own)
+        left = min(plan_of(use="global", work=asks * seen.early).error, caustic.error)
+        if plan_of(use="none", later=whole - own).error > _CLOSE * left:
+            return None
+        doubt = _doubt(seen.caustic, self.reader.light(caustics(self.maps[0]), seen.points), weight)
+        plan = plan_of(use="none", later=going_on - own + (doubt or 1) * (whole - going_on))
+        return plan if doubt and plan.error < _CLOSE * left else None
+
     def _of_reading(self, points) -> tuple[Found, Callable[..., Plan], Any]:
         """(what is found at the points, plans, weight of each pair) that go by all light there."""
         own, weigh = self.seen.own, self.seen.tiles.weight
-        found = self.read(self.maps, points, lambda gathered: weigh(own + gathered))
+        found = self.reader.found(self.maps, points, lambda gathered: weigh(own + gathered))
         weight = weigh(own + found.light)
         plan_of = partial(self.plan_of, weight=weight, v_own=within(own, own, weight))
         return found, plan_of, weight
@@ -310,7 +317,7 @@ def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray |
         place = sample + dr.opaque(mi.UInt32, 0)  # not the sampler's own variable: as in passes
         thinning = Thinning.of_pass(few, seed, pixel, place, each)
     L, _, _ = scene.trace(sampler, ray, thinning=thinning)
-    own = _pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
+    own = pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
     weight = fine.weight(own + coarse.refined(plan.gathered, fine)[:, None])
     noise = STRATIFIED * within(own, own, weight) + coarse.refined(plan.noise, fine)
     work = coarse.refined(smooth(coarse.grid(plan.path_work)).ravel(), fine)
@@ -328,81 +335,6 @@ def _pairs(sensor, tiles: Tiles, seed: int, stream: int):
     return sampler, ray, pixel, sample
 
 
-def _read(scene: Prepared, sensor, radius, seed: int, tiles: Tiles, maps, points, weigh) -> Found:
-    """weigh: pairs of gathered light → weight of each pair."""
-    colours = wavelengths(sensor, 0.5) if mi.is_spectral else None
-    lanes = tiles.lanes
-    kernels = [_kernels(scene, sensor, radius, width) for width in (NARROW, WIDE)]
-    asked = take(points, dr.arange(mi.UInt32, -(-dr.width(points.lane) // _ASKED)) * _ASKED)
-    dr.eval(asked)  # so that the kernel is that of all points
-    # Scored without weight: one kernel serves all gathers.
-    unweighted = dr.opaque(mi.Float, 0, lanes)
-    few = _gathered(
-        *kernels[0], seed, asked, colours, lanes, maps[0], _scores(maps[0], unweighted)
-    )[2]
-    most = float(few.mean()) * _ASKED * lanes * (1 if radius else (WIDE / NARROW) ** 2)
-    if most > _MET_BY_ALL:
-        left = int(maps[0].emitted * _MET_BY_ALL / most)
-        maps = [thinned(map_, max(left, _FEWEST)) for map_ in maps]
-
-    found: list[Any] = []
-    weight = unweighted
-    for scene_, size in kernels:
-        if found:
-            weight = weigh(0.5 * (found[0][0][0] + found[0][1][0]))
-            weight = arrays.own(mi.Float, np.repeat(weight, 2 * SAMPLES).astype(np.float32))
-        scores = [_scores(map_, weight) for map_ in maps]
-        gather = partial(_gathered, scene_, size, seed, points, colours, lanes)
-        found.append([gather(*each) for each in zip(maps, scores, strict=True)])
-    (a, over_lobes, met), (b, _, _) = found[0]
-    (wide_a, _, _), (wide_b, _, _) = found[1]
-    dearer = _dearer(points, _ASKS_GATHER)
-    here = dr.zeros(mi.Float, lanes)
-    dr.scatter_add(here, mi.Float(1), points.lane)
-    met, each = dearer * met, dearer * _pairwise(here).mean(1)
-    learned = _learned(maps, [column for column, _ in scores])
-    emitted, stored = maps[0].emitted, maps[0].stored
-    return Found(a, b, wide_a, wide_b, over_lobes, met, each, emitted, stored, learned)
-
-
-def _dearer(points, times: float) -> float:
-    """``times`` where no receiver is Lambertian, 1 where all are."""
-    if points.lambertian is None or not dr.width(points.lambertian):
-        return 1.0
-    return 1 + (times - 1) * (1 - float(dr.mean(mi.Float(points.lambertian))[0]))
-
-
-def _scores(map_: PhotonMap, weight):
-    """As ``Prepared.gather`` has them."""
-    return dr.opaque(mi.Float, 0, max(map_.stored, 1)), weight
-
-
-def _kernels(scene: Prepared, sensor, radius, width: float) -> tuple[Prepared, float]:
-    """The scene, and a bandwidth, with which kernels have the given radius, or are as wide as they
-    are told to be, in pixels."""
-    if radius:
-        return scene, radius
-    size = 0.1 * scene.extent
-    free = footprint.of(sensor, size, width)
-    assert free  # else a radius is given (see ``pilot.settle``)
-    return replace(scene, footprint=replace(free, least=dr.opaque(mi.Float, 1e-6))), size
-
-
-def _learned(maps, columns) -> aim.Learned | None:
-    """How light paths should be aimed, from the scores of the photons of two maps."""
-    scores, left = [], []
-    for map_, column in zip(maps, columns, strict=True):
-        if not map_.stored:
-            return None
-        path, score = map_.origins.path.numpy(), np.nan_to_num(column.numpy(), posinf=0)
-        scores.append(np.bincount(path, score, map_.emitted))
-        left.append(np.bincount(path, minlength=map_.emitted))
-    photons_left = np.array(left, np.float64)
-    work = LIGHT_PATH + LEFT * photons_left
-    numbers = np.stack([map_.origins.numbers for map_ in maps])
-    return aim.learn(numbers, np.array(scores), work, photons_left)
-
-
 def _doubt(caustic, light, weight) -> float | None:
     """By what to multiply the variance that caustics are seen to have in path tracing: what rarely
     hits is noisier than a few hits tell. None where too little was found to tell; 1 where there is
@@ -416,21 +348,3 @@ def _doubt(caustic, light, weight) -> float | None:
     if as_many < _FEWEST_HITS or float(hits.mean()) < _FOUND * there:
         return None
     return max(1.0, _HITS / as_many)
-
-
-def _gathered(scene, radius, seed, points, colours, lanes, map_, scores):
-    """(light of pairs, the part of it that has come over lobes, photons an eye path meets)."""
-    light, over_lobes, met = (dr.zeros(mi.Float, lanes) for _ in range(3))
-    r = dr.opaque(mi.Float, radius)
-    for found in scene.gather(map_, r, seed, points, colours, scores) if map_.stored else ():
-        radiance = channel_mean(found.radiance)
-        dr.scatter_add(light, radiance, found.lane)
-        dr.scatter_add(over_lobes, radiance, found.lane, found.follows)
-        dr.scatter_add(met, mi.Float(found.photons), found.lane)
-    return _pairwise(light), _pairwise(over_lobes), _pairwise(met).mean(1)
-
-
-def _pairwise(values) -> np.ndarray:
-    """Means over SAMPLES lanes, (pairs, 2), finite, double precision."""
-    values = np.nan_to_num(values.numpy().astype(np.float64), posinf=0, neginf=0)
-    return values.reshape(-1, 2, SAMPLES).mean(-1)
