@@ -123,7 +123,14 @@ def test_results_keep_to_their_schema(done):
 def test_all_that_was_asked_for_is_in_the_table(done):
     found = results(done)
     last = [r for r in found["rows"] if r["budget"] == found["plan"]["times"][-1]]
-    wanted = {"isotropic/default", "isotropic/best", "lobe/default", "lobe/best", "path"}
+    wanted = {
+        "aniso_pm",
+        "isotropic/default",
+        "isotropic/best",
+        "lobe/default",
+        "lobe/best",
+        "path",
+    }
     assert {r["method"] for r in last} == wanted
     assert {r["region"] for r in last} == {"whole", "anisotropic", "caustic"}
     for row in found["rows"]:
@@ -354,7 +361,7 @@ def test_interrupted_reports_keep_what_is_done(scene, tmp_path, monkeypatch, cap
     [
         (["--method", "pathh"], "pathh"),
         (["--method", "lobe/worst"], "default, best"),
-        (["--method", "aniso_pm"], "name a kernel instead"),
+        (["--method", "aniso_pm:spp=4"], "without parameters"),
         (["--method", "path:max_depth"], "KEY=VALUE"),
         (["--seeds", "2"], "seeds is 2"),
         (["--time", "0.01"], "seconds is 0.01"),
@@ -391,6 +398,11 @@ def test_names_stand_for_methods():
     assert found[3].plugin == {"type": "path", "max_depth": 3, "hide_emitters": True}
     with pytest.raises(InputError, match="not an integrator"):
         methods.parse("independent")
+    (installed,) = methods.parse("aniso_pm")
+    assert installed.plugin == {"type": "aniso_pm"} and installed.label == "as installed"
+    assert installed.ours and methods.parse_all(Plan().methods)[0] == installed
+    with pytest.raises(InputError, match="without parameters"):
+        methods.parse("aniso_pm:photon_count=5")
 
 
 def test_budgets_span_two_decades():

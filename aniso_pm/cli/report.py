@@ -30,8 +30,9 @@ def report(
         typer.Option(
             "--method",
             metavar="NAME",
-            help="isotropic, lobe, taylor, paper (each at its default and at its best bandwidth; "
-            "NAME/default, NAME/best), or an integrator of Mitsuba's: path, path:max_depth=8.",
+            help="aniso_pm (as installed), isotropic, lobe, taylor, paper (each at its default and "
+            "at its best bandwidth; NAME/default, NAME/best), or an integrator of Mitsuba's: path, "
+            "path:max_depth=8.",
         ),
     ] = None,
     seconds: Annotated[
@@ -42,11 +43,11 @@ def report(
     ] = None,
     seeds: Annotated[int | None, typer.Option(help="Runs of each method (5).")] = None,
     photons: Annotated[
-        int | None, typer.Option(help="Light paths of a pass of a photon mapper (250000).")
+        int | None, typer.Option(help="Light paths of a pass where kernels are compared (250000).")
     ] = None,
     spp: Annotated[int | None, typer.Option(help="Samples per pixel of such a pass (8).")] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="A look: half a second, 3 seeds, 5 methods.")
+        bool, typer.Option("--quick", help="A look: 1.5 seconds, 3 seeds, 6 methods.")
     ] = False,
     denoise: Annotated[
         bool,

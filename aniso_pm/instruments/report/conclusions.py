@@ -6,7 +6,7 @@ from collections import Counter
 from typing import Any
 
 from . import regions
-from .methods import DENOISED
+from .methods import DENOISED, INSTALLED
 
 # Pixels in which a comparison is made, if the scene has them; all of them else.
 _AGAINST_ISOTROPIC = (regions.ANISOTROPIC, regions.WHOLE)
@@ -40,6 +40,7 @@ def conclusions(results: dict[str, Any], scene: dict[str, Any]) -> list[dict[str
     return sorted(
         found,
         key=lambda r: (
+            r["method"].partition(",")[0] != INSTALLED,
             not r["base"].startswith("isotropic"),
             list(regions.DEFINITIONS).index(r["region"]),
             order.index(r["method"]),
@@ -52,11 +53,18 @@ def too_slow(results: dict[str, Any], scene: dict[str, Any]) -> list[str]:
     shown = {row["method"] for row in results["rows"] if row["scene"] == scene["name"]}
     failed = {failure["method"] for failure in scene["failures"]}
     return [
-        f"{method['label']}: no picture within {results['plan']['seconds']:g} s (set-up alone "
-        f"takes {method['setup_seconds']:.2g} s); give a larger --time"
+        f"{method['label']}: no picture within {results['plan']['seconds']:g} s ({_late(method)}); "
+        "give a larger --time"
         for method in scene["methods"]
         if method["name"] not in shown and method["name"] not in failed
     ]
+
+
+def _late(method: dict[str, Any]) -> str:
+    """Why; what was not over in time was not measured."""
+    if method["setup_seconds"] > 0:
+        return f"set-up alone takes {method['setup_seconds']:.2g} s"
+    return "no pass was over by then"
 
 
 def as_text(results: dict[str, Any]) -> str:

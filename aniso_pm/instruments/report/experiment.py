@@ -25,7 +25,7 @@ from aniso_pm.rendering.settings import Settings
 from . import metrics, reference, regions, runs, sweep
 from .cells import Cell, Store
 from .machine import describe
-from .methods import ISOTROPIC, Method, parse_all
+from .methods import ISOTROPIC, RULES, Method, parse_all
 from .plan import REGION_SEED, SWEEP_SEED, WARM_SEED, Plan
 
 # Stopping rules and the size of passes are the report's.
@@ -256,6 +256,8 @@ class _Experiment:
         if not method.ours:
             # The size of passes is for the photon mappers.
             return [(self.stages["large"], None, self.plan.times)]
+        if method.installed:
+            return [(self.stages["large"], None, self.plan.times)]
         parts = []
         for name, size in self.plan.sizes.items():
             radius = None
@@ -276,8 +278,8 @@ class _Experiment:
 def _same(method: Method, methods: list[Method]) -> bool:
     """Where a scene has no anisotropic surface, every rule is the isotropic kernel: one of them is
     run, to show that it costs nothing, if the isotropic kernel itself is."""
-    rules = [m for m in methods if m.ours and m.kernel != ISOTROPIC]
-    return method in rules[1:] and len(rules) < sum(m.ours for m in methods)
+    rules = [m for m in methods if m.kernel in RULES]
+    return method in rules[1:] and any(m.kernel == ISOTROPIC for m in methods)
 
 
 def _hash(entries: dict[str, Any]) -> str:

@@ -1,10 +1,11 @@
 """What is compared: names on the command line → integrators with parameters.
 
-``isotropic``, ``lobe``, ``taylor`` and ``paper`` are this package's photon mapper with that kernel,
-each twice: at its default bandwidth, which a pilot chooses in each rendering, and at its own best
-one, which a sweep over other seeds has found. ``NAME/default`` and ``NAME/best`` name one of the
-two. Every other name is one of Mitsuba's integrators, perhaps with parameters:
-``path:max_depth=8,rr_depth=16``.
+``aniso_pm`` is this package's photon mapper as installed: nothing is set but the scene's limits of
+path length. ``isotropic``, ``lobe``, ``taylor`` and ``paper`` are the same with that kernel, and
+with passes of a given size so that kernels alone differ, each twice: at its default bandwidth,
+which a pilot chooses in each rendering, and at its own best one, which a sweep over other seeds has
+found. ``NAME/default`` and ``NAME/best`` name one of the two. Every other name is one of Mitsuba's
+integrators, perhaps with parameters: ``path:max_depth=8,rr_depth=16``.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from typing import Any
 from aniso_pm.errors import InputError
 from aniso_pm.kernel import RULES
 
-ISOTROPIC, PATH = "isotropic", "path"
+INSTALLED, ISOTROPIC, PATH = "aniso_pm", "isotropic", "path"
 KERNELS = (ISOTROPIC, *RULES)
 BANDWIDTHS = ("default", "best")
-STANDARD = (ISOTROPIC, "lobe", "taylor", "paper", PATH, "ptracer")
-QUICK = (ISOTROPIC, "lobe", PATH)
+STANDARD = (INSTALLED, ISOTROPIC, "lobe", "taylor", "paper", PATH, "ptracer")
+QUICK = (INSTALLED, ISOTROPIC, "lobe", PATH)
 # At the end of the names and labels of denoised methods.
 DENOISED = ", denoised"
 
@@ -31,7 +32,8 @@ class Method:
 
     name        as in the results: "lobe/best", "path:max_depth=8".
     plugin      type and parameters of the integrator that differ from the scene's own.
-    bandwidth   "default", "best", or None where there are no kernels.
+    bandwidth   "default", "best", "installed" (with all else by default), or None where there are
+                no kernels.
     denoised    what is measured is its denoised picture.
     """
 
@@ -49,12 +51,18 @@ class Method:
         return self.bandwidth is not None
 
     @property
+    def installed(self) -> bool:
+        return self.bandwidth == "installed"
+
+    @property
     def kernel(self) -> str:
-        """ "isotropic", or the rule; the plugin's name for Mitsuba's."""
+        """ "isotropic", or the rule; the plugin's name as installed and for Mitsuba's."""
         return self.name.partition("/")[0].removesuffix(DENOISED)
 
     @property
     def label(self) -> str:
+        if self.installed:
+            return f"as installed{DENOISED * self.denoised}"
         if not self.ours:
             return self.name
         return f"{self.kernel}, {self.bandwidth} bandwidth" + DENOISED * self.denoised
@@ -67,6 +75,8 @@ class Method:
 
 def parse(name: str) -> list[Method]:
     """The methods that a name stands for. Raises InputError for one that stands for none."""
+    if name == INSTALLED:
+        return [Method(INSTALLED, {"type": INSTALLED}, "installed")]
     kernel, slash, bandwidth = name.partition("/")
     if kernel in KERNELS:
         if slash and bandwidth not in BANDWIDTHS:
@@ -99,14 +109,17 @@ def _mitsubas(name: str) -> Method:
         if not key or not equals:
             raise InputError(f"method '{name}': after '{kind}:' comes KEY=VALUE,…, not '{pair}'")
         plugin[key] = _value(value)
-    if kind == "aniso_pm":
-        raise InputError(f"method '{name}': name a kernel instead, one of {', '.join(KERNELS)}")
+    if kind == INSTALLED:
+        raise InputError(
+            f"method '{name}': {INSTALLED} is as installed, without parameters; else name a "
+            f"kernel, one of {', '.join(KERNELS)}"
+        )
     try:
         made = mi.load_dict(plugin)
     except Exception as error:
         raise InputError(
-            f"method '{name}' is none of {', '.join(KERNELS)}, and Mitsuba cannot make an "
-            f"integrator of it: {error}"
+            f"method '{name}' is none of {', '.join((INSTALLED, *KERNELS))}, and Mitsuba cannot "
+            f"make an integrator of it: {error}"
         ) from error
     if not isinstance(made, mi.Integrator):
         raise InputError(f"method '{name}': Mitsuba's '{kind}' is not an integrator")

@@ -23,7 +23,7 @@ class Plan:
     seconds      largest budget; the smallest is a hundredth of it.
     budgets      how many, in equal steps of their logarithm.
     seeds        independent runs of each method; intervals need three.
-    photons      light paths of a pass of the photon mappers.
+    photons      light paths of a pass of the photon mappers whose kernels are compared.
     spp          samples per pixel of such a pass.
     early        share of the largest budget up to which pictures are taken from another run, whose
                  passes are an eighth of that: who has less time takes smaller passes.
@@ -70,7 +70,7 @@ class Plan:
     @classmethod
     def quickly(cls, **changes) -> Plan:
         """A plan for a look: fewer methods, seeds and budgets, shorter runs, smaller passes."""
-        few = {"methods": QUICK, "seconds": 0.6, "budgets": 5, "seeds": 3}
+        few = {"methods": QUICK, "seconds": 1.5, "budgets": 5, "seeds": 3}
         few |= {"photons": 60_000, "spp": 2, "early": 0.0}
         few |= {"sweep_share": 0.6, "fine": False, "quick": True}
         return cls(**few | changes)

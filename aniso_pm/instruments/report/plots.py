@@ -18,6 +18,7 @@ from . import metrics
 
 # Okabe and Ito's colours, which everybody can tell apart.
 COLOURS = {
+    "as installed": "#E69F00",
     "isotropic": "#0072B2",
     "lobe": "#D55E00",
     "taylor": "#009E73",
@@ -25,8 +26,16 @@ COLOURS = {
     "path": "#222222",
     "ptracer": "#8a8a8a",
 }
-_MORE = ("#E69F00", "#56B4E9", "#a0522d", "#6a3d9a")
-_MARKS = {"isotropic": "o", "lobe": "s", "taylor": "^", "paper": "v", "path": "D", "ptracer": "x"}
+_MORE = ("#56B4E9", "#a0522d", "#6a3d9a", "#b5a800")
+_MARKS = {
+    "as installed": "*",
+    "isotropic": "o",
+    "lobe": "s",
+    "taylor": "^",
+    "paper": "v",
+    "path": "D",
+    "ptracer": "x",
+}
 _SIZE = (5.2, 4.5)
 # Decades above the smallest error beyond which a curve leaves the picture.
 _DECADES = 3

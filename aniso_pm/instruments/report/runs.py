@@ -90,12 +90,12 @@ class Stage:
 
     def parameters(self, method: Method, radius: float | None) -> dict[str, Any]:
         """The plugin's parameters in this scene. radius: of the first pass, None: by default."""
-        if not method.ours:
-            return self.limits | method.plugin
+        more: dict[str, Any] = {"layers": "denoising"} if method.ours and method.denoised else {}
+        if not method.ours or method.installed:
+            return self.limits | method.plugin | more
         passes = {"photon_count": self.photons, "passes": 0}
-        more = {} if radius is None else {"initial_radius": radius}
-        if method.denoised:
-            more["layers"] = "denoising"
+        if radius is not None:
+            more["initial_radius"] = radius
         return self.own | self.limits | method.plugin | passes | more
 
     def seen_by(self, method: Method) -> tuple[Any, Any]:
@@ -202,7 +202,8 @@ def _passes(stage: Stage, method: Method, radius, seed: int, recorder: _Recorder
     dr.kernel_history_clear()
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:
-        integrator.render(stage.scene, sensor=stage.sensor, seed=seed, spp=stage.spp)
+        spp = 0 if method.installed else stage.spp  # as the scene's sampler says
+        integrator.render(stage.scene, sensor=stage.sensor, seed=seed, spp=spp)
     except _Enough:
         return compiled
     finally:
