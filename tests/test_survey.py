@@ -180,6 +180,7 @@ def _plan(light_paths=0, met=4000.0, aside=5.0, edge=2):
         emitted=50_000,
         stored=100_000,
         aim=None,
+        met_by_any=10_000,
     )
     return plan.Plan._of(
         32,
@@ -354,14 +355,14 @@ def test_path_tracing_has_found_caustics_by_hits_or_where_there_are_next_to_none
     weight, there = np.ones(1000), np.full((1000, 2), 0.1)
     many, few = np.zeros((1000, 2)), np.zeros((1000, 2))
     many[:200, 0], few[:20, 0] = 1.0, 10.0  # the light of the map, by 200 hits and by 20
-    assert survey._doubt(many, there, weight) == 1
-    assert survey._doubt(few, there, weight) == pytest.approx(64 / 20)
+    assert survey._doubt(many, [there], weight) == 1
+    assert survey._doubt(few, [there], weight) == pytest.approx(64 / 20)
     fewest = np.zeros((1000, 2))
     fewest[:7, 0] = 200 / 7
-    assert survey._doubt(fewest, there, weight) is None
-    assert survey._doubt(0.5 * many, there, weight) is None
-    assert survey._doubt(0 * many, 5e-4 * there, weight) == 1
-    assert survey._doubt(0 * many, 5e-3 * there, weight) is None
+    assert survey._doubt(fewest, [there], weight) is None
+    assert survey._doubt(0.5 * many, [there], weight) is None
+    assert survey._doubt(0 * many, [5e-4 * there], weight) == 1
+    assert survey._doubt(0 * many, [5e-3 * there], weight) is None
 
 
 def test_few_hits_of_caustics_count_against_path_tracing(variant_llvm_rgb, monkeypatch):

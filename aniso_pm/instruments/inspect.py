@@ -244,8 +244,9 @@ def as_promises(errors: dict[str, float | None]) -> str:
     if not errors:
         return "a pilot found no photon to gather"
     why = "; photons could not lessen it by much" if list(errors) == ["none"] else ""
+    missed = {"none": "finds too little of the caustics"}
     words = [
-        f"{use} {'finds too little of the caustics' if error is None else f'{error:.1e}'}"
+        f"{use} {missed.get(use, 'misses what eye paths see') if error is None else f'{error:.1e}'}"
         for use, error in errors.items()
     ]
     return f"relative MSE that a pilot promises: {', '.join(words)}{why}"

@@ -76,7 +76,7 @@ class Found:
     """What a use of the map gives to the pairs: light from map a, b through narrow kernels and
     through wide ones, what came over lobes of a, (pairs, 2); photons that an eye path meets and
     gather points that it leaves (pairs), as many as on Lambertian receivers would be the same work;
-    light paths and photons of a map; how to aim those."""
+    light paths and photons of a map; how to aim those; photons of both maps that any pair meets."""
 
     a: np.ndarray
     b: np.ndarray
@@ -88,6 +88,12 @@ class Found:
     emitted: int
     stored: int
     aim: aim.Learned | None
+    met_by_any: int
+
+    @property
+    def maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Light of each."""
+        return self.wide_a, self.wide_b
 
     @property
     def light(self) -> np.ndarray:

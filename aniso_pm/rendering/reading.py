@@ -71,9 +71,13 @@ class Reader:
         here = dr.zeros(mi.Float, self.lanes)
         dr.scatter_add(here, mi.Float(1), points.lane)
         met, each = asks * met, asks * pairwise(here).mean(1)
-        learned = _learned(maps, [column for column, _ in scores])
+        columns = [np.nan_to_num(column.numpy(), posinf=0) for column, _ in scores]
         emitted, stored = maps[0].emitted, maps[0].stored
-        return Found(a, b, wide_a, wide_b, over_lobes, met, each, emitted, stored, learned)
+        return Found(
+            *(a, b, wide_a, wide_b, over_lobes, met, each, emitted, stored),
+            aim=_learned(maps, columns),
+            met_by_any=sum(int(np.count_nonzero(column)) for column in columns),
+        )
 
     @cached_property
     def _colours(self):
@@ -145,8 +149,8 @@ def _learned(maps, columns) -> aim.Learned | None:
     for map_, column in zip(maps, columns, strict=True):
         if not map_.stored:
             return None
-        path, score = map_.origins.path.numpy(), np.nan_to_num(column.numpy(), posinf=0)
-        scores.append(np.bincount(path, score, map_.emitted))
+        path = map_.origins.path.numpy()
+        scores.append(np.bincount(path, column, map_.emitted))
         left.append(np.bincount(path, minlength=map_.emitted))
     photons_left = np.array(left, np.float64)
     work = LIGHT_PATH + LEFT * photons_left

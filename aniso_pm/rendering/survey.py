@@ -12,7 +12,8 @@ path tracing and tell apart what each use leaves to them (see ``survey_parts``).
 is chosen, its error after the work of M passes of path tracing, C_0 for each path. Path tracing
 finds some caustics by rare hits that a pilot may miss, so that their variance seems small; it is
 chosen only where it has found the caustics that the map holds, their variance taken to be the
-larger the fewer hits they were, or where these are next to none. What the other uses leave to eye
+larger the fewer hits they were, or where these are next to none. Nor is a map chosen that misses
+what eye paths have met, where they may do without. What the other uses leave to eye
 paths bounds their errors from below: where path tracing comes close to that, no map is read.
 """
 
@@ -59,6 +60,9 @@ _BETTER = 0.9
 # are less than such a share of the picture's light. With fewer than the last number of hits their
 # variance is taken to be larger than it looks.
 _FOUND, _FEWEST_HITS, _NOTHING, _HITS = 0.7, 8, 1e-4, 64
+# Maps miss light that eye paths have met by so many hits if one of them has less than such a share
+# of it, or if they show so few photons, which tell neither noise nor width.
+_OFTEN, _MISSED, _FEW_PHOTONS = 16, 0.5, 64
 # Path tracing comes close where it promises so many times the error that is left to eye paths, at
 # the most: with what photons cost, and with their noise, errors were 1.9 to 50 times as large.
 _CLOSE = 1.5
@@ -70,7 +74,7 @@ class Survey:
 
     use          of the map (see ``uses``).
     errors       relative MSE that each use promises, by its name, where there was a choice; None
-                 where path tracing has not found what the map holds.
+                 where path tracing has not found what the map holds, or maps miss what it found.
     each         eye samples of a pixel in a pass, in the mean: fewer than asked for where light
                  paths would make a pass too long.
     share        of the eye paths of each pixel that should gather (see ``thinning``).
@@ -230,6 +234,8 @@ class _Pilot:
         best = plan_of(use="global", found=found, work=asks * seen.early)
         errors: dict[str, float | None] = {"global": best.error}
         read: tuple[Any, Any] = self.maps[0], first
+        if self._misses(seen.later + seen.caustic, found, weight):
+            errors["global"], best = None, replace(best, error=math.inf)
 
         # --- The other ones, unless their eye paths alone are too dear ---
         light = seen.own + seen.later
@@ -241,11 +247,13 @@ class _Pilot:
         work = _GOING_ON * asks * seen.work
         plan = plan_of(use="caustic", found=found, later=later, work=work)
         errors["caustic"] = plan.error
-        if plan.error < _BETTER * best.error:
+        if self._misses(seen.caustic, found, weight):
+            errors["caustic"] = None
+        elif plan.error < _BETTER * best.error:
             best, read = plan, (maps[0], seen.points)
         if self.scene.photons_are_dispensable:
             errors["none"] = None
-            doubt = _doubt(seen.caustic, found.light, weight)
+            doubt = _doubt(seen.caustic, found.maps, weight)
             if doubt:
                 all_ = light + seen.caustic
                 of_caustics = within(all_, all_, weight) - within(light, light, weight)
@@ -268,9 +276,20 @@ class _Pilot:
         left = min(plan_of(use="global", work=asks * seen.early).error, caustic.error)
         if plan_of(use="none", later=whole - own).error > _CLOSE * left:
             return None
-        doubt = _doubt(seen.caustic, self.reader.light(caustics(self.maps[0]), seen.points), weight)
+        light = self.reader.light(caustics(self.maps[0]), seen.points)
+        doubt = _doubt(seen.caustic, [light], weight)
         plan = plan_of(use="none", later=going_on - own + (doubt or 1) * (whole - going_on))
         return plan if doubt and plan.error < _CLOSE * left else None
+
+    def _misses(self, light, found: Found, weight) -> bool:
+        """May a map be left out, and have its pilots too little of ``light``, which eye paths
+        have met?"""
+        if not self.scene.photons_are_dispensable:
+            return False
+        mean, as_many = _hits(light, weight)
+        if mean < _NOTHING or as_many < _OFTEN:
+            return False
+        return found.met_by_any < _FEW_PHOTONS or _least(found.maps, weight) < _MISSED * mean
 
     def _of_reading(self, points) -> tuple[Found, Callable[..., Plan], Any]:
         """(what is found at the points, plans, weight of each pair) that go by all light there."""
@@ -335,16 +354,29 @@ def _pairs(sensor, tiles: Tiles, seed: int, stream: int):
     return sampler, ray, pixel, sample
 
 
-def _doubt(caustic, light, weight) -> float | None:
+def _hits(light, weight) -> tuple[float, float]:
+    """What eye paths have met: (its mean, relative, and the number of equal hits as uneven)."""
+    hits = (light * np.sqrt(weight)[:, None]).ravel()
+    squares = float((hits**2).sum())
+    return float(hits.mean()), float(hits.sum()) ** 2 / squares if squares else 0.0
+
+
+def _least(maps, weight) -> float:
+    """As the mean of ``_hits``: light of that of several maps that has the least of it."""
+    root = np.sqrt(weight)[:, None]
+    return min(float((light * root).mean()) for light in maps)
+
+
+def _doubt(caustic, maps, weight) -> float | None:
     """By what to multiply the variance that caustics are seen to have in path tracing: what rarely
     hits is noisier than a few hits tell. None where too little was found to tell; 1 where there is
-    next to nothing. caustic: found by eye paths; light: of the map."""
-    root = np.sqrt(weight)[:, None]
-    hits, there = (caustic * root).ravel(), float((light * root).mean())
+    next to nothing. caustic: found by eye paths; maps: light of each."""
+    mean, as_many = _hits(caustic, weight)
+    there = _least([sum(maps) / len(maps)], weight)
+    if as_many >= _OFTEN:  # they tell more than a photon that one map has by luck
+        there = _least(maps, weight)
     if there < _NOTHING:
         return 1.0
-    squares = float((hits**2).sum())
-    as_many = float(hits.sum()) ** 2 / squares if squares else 0.0
-    if as_many < _FEWEST_HITS or float(hits.mean()) < _FOUND * there:
+    if as_many < _FEWEST_HITS or mean < _FOUND * there:
         return None
     return max(1.0, _HITS / as_many)
