@@ -151,6 +151,7 @@ def test_unknown_groups_are_named(capsys):
     [
         (["pass", "--scene", "any.xml"], "--scene is for the group error"),
         (["error", "--scene", "missing.xml"], "missing.xml"),
+        (["error", "-D", "width=4"], "--scene"),
     ],
 )
 def test_scenes_are_for_the_group_error_and_have_to_be_there(capsys, given, said):
@@ -158,13 +159,20 @@ def test_scenes_are_for_the_group_error_and_have_to_be_there(capsys, given, said
     assert said in capsys.readouterr().err
 
 
-def test_a_scene_without_reference_is_a_row_that_says_how_to_make_one(
-    own_cache, write_scene, capsys
-):
+def test_a_scene_without_reference_is_refused_with_how_to_make_one(own_cache, write_scene, capsys):
     scene = write_scene()
-    assert cli.main(["bench", "error", "--scene", str(scene), "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    assert row["figure"] is None and "aniso-pm reference" in row["note"]
+    command = ["bench", "error", "--quick", "--scene", str(scene), "--json"]
+    assert cli.main(command) == 2
+    assert "aniso-pm reference" in capsys.readouterr().err
+    size = ["-D", "width=12"]
+    assert cli.main(["reference", str(scene), "--spp", "16", "--quiet", *size]) == 0
+    assert cli.main(command) == 2  # of another size
+    assert cli.main(["bench", "--quick", *size]) == 2
+    assert "--scene" in capsys.readouterr().err
+    capsys.readouterr()
+    assert cli.main([*command, *size]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert all("reference's own error" in row["note"] for row in rows)
 
 
 def test_a_run_without_a_picture_in_time_is_a_note_and_no_number(

@@ -43,7 +43,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     except BaseException as error:
         if hasattr(error, "format_message"):  # typer's own: wrong usage
-            return _fail(2, f"{error.format_message()} (see aniso-pm --help)", error)
+            command = getattr(getattr(error, "ctx", None), "command_path", "aniso-pm")
+            return _fail(2, f"{error.format_message()} (see {command} --help)", error)
         if isinstance(error, InterruptError):
             return _fail(INTERRUPTED, str(error), error)
         if isinstance(error, typer.Abort | KeyboardInterrupt):

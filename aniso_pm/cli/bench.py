@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from aniso_pm.errors import InputError
 
-from .common import Variant, load, mitsuba_log, set_variant
+from .common import Define, Variant, load, mitsuba_log, parse_defines, set_variant
 
 
 def bench(
@@ -28,6 +28,7 @@ def bench(
             "reference). Can be repeated.",
         ),
     ] = None,
+    define: Define = None,
     variant: Variant = "llvm_ad_rgb",
     quick: Annotated[
         bool, typer.Option("--quick", help="Smaller sizes, fewer repetitions; less than a minute.")
@@ -43,6 +44,7 @@ def bench(
     Exit status 0 also where a target is missed.
     """
     from aniso_pm.instruments.bench import GROUPS, LONG
+    from aniso_pm.instruments.report import reference
 
     groups = groups or [group for group in GROUPS if group not in LONG]
     for group in groups:
@@ -54,9 +56,14 @@ def bench(
     wanted = [group for group in GROUPS if group in groups or "all" in groups]
     if scenes and "error" not in wanted:
         raise InputError("--scene is for the group error: aniso-pm bench error --scene FILE")
+    if define and not scenes:
+        raise InputError("--define is for scenes that are named by --scene")
+    defines = parse_defines(define or [])
     set_variant(variant)
     for file in scenes or []:
-        load(file, {}, 0, needed=False)  # what is wrong with it is said before anything is rendered
+        # What is wrong with it is said before anything is rendered.
+        world, camera, _ = load(file, defines, 0, needed=False)
+        reference.require(file, world, camera)
 
     from aniso_pm.instruments.bench import measure
     from aniso_pm.instruments.bench.row import HEADER, as_data, line, summary
@@ -66,7 +73,7 @@ def bench(
         print(HEADER)
     rows = []
     with mitsuba_log(quiet=False):
-        for row in measure(wanted, quick, scenes):
+        for row in measure(wanted, quick, scenes, defines):
             rows.append(row)
             if not as_json:
                 print(line(row), flush=True)

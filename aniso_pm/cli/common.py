@@ -96,6 +96,13 @@ def telling_what_is_kept(state: Path) -> Iterator[None]:
         raise
 
 
+def require_file(scene: Path) -> None:
+    if scene.is_dir():
+        raise InputError(f"{scene}: this is a directory, not a scene")
+    if not scene.is_file():
+        raise InputError(f"{scene}: there is no such file")
+
+
 def make_directory(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -264,7 +271,7 @@ def mitsuba_log(quiet: bool) -> Iterator[None]:
                 message = re.sub(
                     r"^\s*(\[[^]]*\]\s*)?\w+\(\): ", "", message
                 )  # where it was logged
-                message = one_line(message.strip())
+                message = one_line(message.strip()).removeprefix("aniso_pm: ")
                 said[message] += 1
                 if said[message] == 1:
                     print(f"aniso-pm: warning: {message}", file=sys.stderr)

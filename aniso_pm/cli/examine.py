@@ -18,6 +18,7 @@ from .common import (
     make_directory,
     mitsuba_log,
     parse_defines,
+    require_file,
     set_variant,
 )
 
@@ -33,8 +34,7 @@ def inspect(
 
     A scene whose integrator is another one is inspected for aniso_pm with default parameters.
     """
-    if not scene.is_file():
-        raise InputError(f"{scene}: there is no such file")
+    require_file(scene)
     set_variant(variant)
     with mitsuba_log(quiet=False):
         world, _, integrator = load(scene, parse_defines(define or []), 0, needed=False)

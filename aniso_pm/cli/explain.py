@@ -19,6 +19,7 @@ from .common import (
     load,
     mitsuba_log,
     parse_defines,
+    require_file,
     set_variant,
 )
 
@@ -56,8 +57,7 @@ def explain(
     place = _parse_pixel(pixel)
     if out is not None:
         _check_picture(out)
-    if not scene.is_file():
-        raise InputError(f"{scene}: there is no such file")
+    require_file(scene)
     set_variant(variant)
     with mitsuba_log(quiet=False):
         world, camera, integrator = load(scene, parse_defines(define or []), sensor, needed=False)

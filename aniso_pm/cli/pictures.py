@@ -56,7 +56,10 @@ class Pictures:
         from aniso_pm.pictures import denoising, display
 
         if out.suffix.lower() != ".exr":
-            raise InputError(f"cannot write '{out}': the output's name must end in .exr")
+            raise InputError(
+                f"cannot write '{out}': the output's name must end in .exr; --png writes a PNG "
+                "beside it"
+            )
         if bits not in (8, 16):
             raise InputError(f"--bits is {bits}; a PNG has 8 or 16 bits a channel")
         if not png and (exposure or tonemap != "srgb" or bits != 8):

@@ -22,6 +22,7 @@ from .common import (
     make_directory,
     mitsuba_log,
     parse_defines,
+    require_file,
     set_variant,
 )
 
@@ -72,8 +73,7 @@ def reference(
         raise InputError(f"cannot write '{out}': the output's name must end in .exr")
     if out:
         output.check_writable(out)
-    if not scene.is_file():
-        raise InputError(f"{scene}: there is no such file")
+    require_file(scene)
     defines = parse_defines(define or [])
     set_variant(variant)
     with mitsuba_log(quiet):

@@ -32,6 +32,7 @@ from .common import (
     mitsuba_log,
     parse_defines,
     parse_parameters,
+    require_file,
     set_variant,
     stopping_rules,
     telling_what_is_kept,
@@ -123,8 +124,7 @@ def render(
     rules = stopping_rules(passes, seconds, target_error)
     parameters = parse_parameters(parameter, layers=layer_names, **rules)
     pictures = Pictures.checked(out, png, exposure, tonemap, bits, denoise)
-    if not scene.is_file():
-        raise InputError(f"{scene}: there is no such file")
+    require_file(scene)
     state_file = out.with_suffix(".state")
 
     set_variant(variant)
@@ -376,10 +376,15 @@ def _done(record: dict[str, Any], out: Path, picture: Path | None) -> str:
     if statistics.get("passes"):
         parts.append(f"{statistics['passes']} pass{'es' * (statistics['passes'] > 1)}")
     if statistics.get("photons_stored"):
-        parts.append(f"kernel radius {statistics['initial_radius']:.3g}")
+        first = statistics["initial_radius"]
+        radii = [f"{radius:.3g}" for radius in (first, statistics.get("radius") or first)]
+        parts.append(f"kernel radius {' to '.join(dict.fromkeys(radii))}")
     if statistics.get("relative_error"):
         parts.append(f"standard error {statistics['relative_error']:.1%}")
-    parts.append(f"{record['seconds']['render']:.1f} s")
+    took, asked = record["seconds"]["render"], record["parameters"].get("time")
+    late = asked and statistics.get("passes") == 1 and took > 1.5 * asked
+    more = f" (asked for {asked:g} s: a pilot and one pass take more)" if late else ""
+    parts.append(f"{took:.1f} s{more}")
     return f"{', '.join(str(path) for path in (out, picture) if path)}: {', '.join(parts)}"
 
 

@@ -26,6 +26,7 @@ from .common import (
     mitsuba_log,
     parse_defines,
     parse_parameters,
+    require_file,
     set_variant,
     stopping_rules,
 )
@@ -76,8 +77,7 @@ def view(
     from aniso_pm.view import server
 
     server.check_host(host, allow_others)
-    if not scene.is_file():
-        raise InputError(f"{scene}: there is no such file")
+    require_file(scene)
     try:
         import flask  # noqa: F401
     except ImportError as error:

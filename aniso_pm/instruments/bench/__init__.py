@@ -36,16 +36,23 @@ GROUPS = {
 LONG = ("error", "large", "denoise")
 
 
-def measure(groups: list[str], quick: bool, scenes: list[Path] | None = None) -> Iterator[Row]:
+def measure(
+    groups: list[str],
+    quick: bool,
+    scenes: list[Path] | None = None,
+    defines: dict[str, str] | None = None,
+) -> Iterator[Row]:
     """The rows of the named groups, as they are measured. A Mitsuba variant has to be set.
 
     quick   smaller sizes, fewer repetitions, no slow row: less than a minute for all but ``LONG``,
             but too small for some of the targets.
-    scenes  that "error" renders instead of the gallery.
+    scenes  that "error" renders instead of the gallery, with the parameters ``defines``.
     """
     for group in groups:
         module, function = GROUPS[group]
-        more: dict[str, Any] = {"files": scenes} if group == "error" else {}
+        more: dict[str, Any] = {}
+        if group == "error":
+            more = {"files": scenes, "defines": defines}
         try:
             yield from getattr(import_module(f"{__name__}.{module}"), function)(quick, **more)
         except InputError as error:

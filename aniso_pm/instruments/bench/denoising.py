@@ -19,7 +19,6 @@ from aniso_pm.errors import InputError
 from aniso_pm.instruments import gallery
 from aniso_pm.instruments.report import metrics, reference, runs
 from aniso_pm.instruments.report.denoised import boxed
-from aniso_pm.instruments.report.experiment import require_reference
 from aniso_pm.instruments.report.methods import Method
 from aniso_pm.pictures import denoising
 
@@ -61,7 +60,7 @@ def _scene(file: Path, budgets, seeds: int, size) -> Iterator[Row]:
     world = mi.load_file(str(file), optimize=False, **size)
     box = boxed(file, size)
     sensor = world.sensors()[0]
-    found = require_reference(file, world, sensor)
+    found = reference.require(file, world, sensor)
     limits = {
         k: v for k, v in reference.path_limits(world.integrator()).items() if v not in (-1, False)
     }

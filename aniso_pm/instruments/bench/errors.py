@@ -21,7 +21,6 @@ import numpy as np
 from aniso_pm.errors import InputError
 from aniso_pm.instruments import gallery
 from aniso_pm.instruments.report import metrics, reference, regions, runs
-from aniso_pm.instruments.report.experiment import require_reference
 from aniso_pm.instruments.report.methods import Method
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
@@ -59,15 +58,17 @@ def measure(
     quick: bool,
     files: list[Path] | None = None,
     plugins: dict[str, dict[str, Any]] | None = None,
+    defines: dict[str, str] | None = None,
 ) -> Iterator[Row]:
     """Rows of the gallery, or of other scenes that have references, in the size of their films.
 
     quick    one second and three seeds only.
     plugins  name → plugin, photon mappers to be compared with ``path``; None: as installed, and
              with ``kernel=isotropic``.
+    defines  parameters of the other scenes.
     """
     budgets, seeds = ((1.0,), 3) if quick else (BUDGETS, SEEDS)
-    size = {} if files else _SIZE
+    size = (defines or {}) if files else _SIZE
     for file in files or [scene.file for scene in gallery.scenes()]:
         yield from _rows("error", Path(file), list(budgets), seeds, plugins, size)
 
@@ -96,7 +97,7 @@ def _scene(
 ) -> Iterator[Row]:
     world = mi.load_file(str(file), optimize=False, **size)
     sensor = world.sensors()[0]
-    found = require_reference(file, world, sensor)
+    found = reference.require(file, world, sensor)
     limits = {
         k: v for k, v in reference.path_limits(world.integrator()).items() if v not in (-1, False)
     }
@@ -135,7 +136,10 @@ def _scene(
                 goal = _goal(file.stem, region, name) if size is _SIZE else None
                 late = sum(run.passes[k] == 0 for run in done[name])
                 if late:
-                    note = f"no pass was done in time in {late} of {seeds} runs"
+                    note = (
+                        f"in {late} of {seeds} runs the pilot and a first pass took longer than "
+                        f"{budget:g} s"
+                    )
                     yield Row(title, None, "×", goal, note)
                     continue
                 images = np.stack([run.images[k] for run in done[name]])

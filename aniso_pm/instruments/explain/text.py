@@ -68,7 +68,7 @@ def _vertex(vertex: Vertex) -> str:
 
 
 def _vector(values) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+    return "(" + ", ".join(f"{value + 0.0:.4g}" for value in values) + ")"  # no -0
 
 
 def _length(vector) -> float:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from aniso_pm.errors import InputError, is_interrupt, one_line
+from aniso_pm.errors import is_interrupt, one_line
 from aniso_pm.instruments.doctor import versions
 from aniso_pm.pictures import denoising
 from aniso_pm.rendering.prepared import prepare
@@ -75,20 +75,8 @@ def measure(
 
     Raises InputError where the scene has no reference.
     """
-    found = require_reference(file, world, sensor)
+    found = reference.require(file, world, sensor)
     return _Experiment(file, world, sensor, plan, store, tick, found, boxed).run()
-
-
-def require_reference(file: Path, world, sensor) -> reference.Reference:
-    """The reference of a scene. Raises InputError with the remedy where there is none."""
-    found = reference.find(file, world, sensor)
-    if found is None:
-        width, height = sensor.film().crop_size()
-        raise InputError(
-            f"{file}: no reference fits this scene at {width} x {height} pixels; make one with "
-            f"'aniso-pm reference {file} --time SECONDS' and the same -D, -m and -s"
-        )
-    return found
 
 
 class _Experiment:

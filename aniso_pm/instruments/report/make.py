@@ -16,10 +16,10 @@ from aniso_pm.instruments.doctor import versions
 from aniso_pm.pictures import denoising
 from aniso_pm.rendering.film import pixel_weights
 
-from . import page, pictures, results
+from . import page, pictures, reference, results
 from .cells import Store
 from .denoised import boxed
-from .experiment import measure, require_reference
+from .experiment import measure
 from .machine import describe
 from .methods import parse_all
 from .plan import Plan
@@ -163,6 +163,6 @@ def _check(files: list[Path], plan: Plan, defines, sensor: int) -> None:
             raise InputError(f"{file}: there is no such file")
     for file in files:
         world, camera = load(file, defines, sensor)
-        require_reference(file, world, camera)
+        reference.require(file, world, camera)
         del world, camera
     gc.collect()

@@ -335,6 +335,18 @@ def find(scene_file: Path, world, sensor) -> Reference | None:
     return read(min(fitting)[1]) if fitting else None
 
 
+def require(file: Path, world, sensor) -> Reference:
+    """The reference of a scene. Raises InputError with the remedy where there is none."""
+    found = find(file, world, sensor)
+    if found is None:
+        width, height = sensor.film().crop_size()
+        raise InputError(
+            f"{file}: no reference fits this scene at {width} x {height} pixels; make one with "
+            f"'aniso-pm reference {file} --time SECONDS' and the same -D, -m and -s"
+        )
+    return found
+
+
 def beside(scene_file: Path) -> list[Path]:
     """Files beside a scene that may be references of it, for one film size or another."""
     scene_file = Path(scene_file)
