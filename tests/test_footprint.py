@@ -56,7 +56,10 @@ def test_kernels_are_never_wider_than_four_bandwidths_nor_narrower_than_passes_a
 ):
     found = footprint.of(camera(), 1.0, 1e-3)
     for least, index in ((1 / 16, 0), (1 / 16, 15), (1 / 17, 16), (1 / 100, 99)):
-        np.testing.assert_allclose(shares(found.in_pass(index), [0]), least, rtol=1e-6)
+        np.testing.assert_allclose(shares(found.in_pass(index), [100]), least, rtol=1e-6)
+    # Nor is a kernel wider than eight pixels for that reason.
+    one = shares(late(footprint.of(camera(), 1.0)), [0.5])
+    np.testing.assert_allclose(shares(found.in_pass(0), [0.5]), footprint.TRIED * one, rtol=1e-5)
     wide = footprint.of(camera(), 1e-6).in_pass(0)
     np.testing.assert_allclose(shares(wide, [100]), 4)
     eight = shares(footprint.of(camera(), 1.0, 8.0).in_pass(0), [20])

@@ -4,8 +4,10 @@ With f the footprint of a pixel at a gather point (world units, its width there,
 path), w the width of the kernel in pixels (``survey`` finds it pixel by pixel), and r_i the
 bandwidth of pass i (0-based, see ``schedule``), the kernel's radius is
 
-    r(p) = clip(w f r_i/r_0, l_i r_i, 4 r_i),      l_i = 1/max(16, i + 1).
+    r(p) = clip(w f r_i/r_0, min(l_i, 8 f/r_0) r_i, 4 r_i),      l_i = 1/max(16, i + 1).
 
+Where photons hardly reach what the camera sees, l_i r_i may be wider than the picture; eight pixels
+are the widest that pilots try.
 Everything shrinks from pass to pass, so that the mean over passes converges as with one radius; r_i
 and l_i are functions of i alone, however many passes there will be: passes that were rendered apart
 add up.
@@ -26,8 +28,8 @@ from .film import sample_ray
 
 # Widest kernels, in pixels, that pilots have tried (see ``survey``).
 TRIED = 8.0
-# Kernels of the first passes may be narrower than the bandwidth by so much, kernels of all passes
-# wider.
+# Kernels of the first passes may be narrower than the bandwidth by so much at least, kernels of all
+# passes wider.
 _LEAST, _MOST = 16, 4
 
 
@@ -37,7 +39,7 @@ class Footprint:
 
     start   width of a pixel at the camera, ``spread`` per world unit of path, both as a share of
             r_0.
-    least   smallest share in this pass, above 0 and at most 1.
+    least   smallest share in this pass where that is less than TRIED pixels, above 0, at most 1.
     widths  of kernels in pixels: one number, or one for each pixel.
     pixel   of each eye path; None where there is one width.
     """
@@ -55,7 +57,8 @@ class Footprint:
         if self.pixel is not None:
             width = dr.gather(mi.Float, width, dr.gather(mi.UInt32, self.pixel, lane))
         width = dr.minimum(width, widest)
-        return dr.clip(width * dr.fma(self.spread, distance, self.start), self.least, _MOST)
+        pixel = dr.fma(self.spread, distance, self.start)
+        return dr.clip(width * pixel, dr.minimum(self.least, TRIED * pixel), _MOST)
 
     def in_pass(self, index: int) -> Footprint:
         """The same in pass ``index`` (0-based)."""

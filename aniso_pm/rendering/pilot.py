@@ -32,10 +32,6 @@ FEWEST, MOST = 10_000, 5_000_000
 _PATHS, _RAYS, _ENOUGH = 50_000, 4096, 16
 # Light paths for which the bandwidth is chosen before their number is.
 USUAL = 250_000
-# The bandwidth at the most, in pixels where these are narrow (a tenth is narrower): kernels of the
-# first passes are no narrower than a sixteenth of it (see ``footprint``). It is one to eighteen
-# pixels unless photons hardly reach what the camera sees.
-_PIXELS, _NARROW = 64, 0.1
 # Range of radii as shares of the scene's extent: 1.2e-5 · 2^13 = 0.1.
 _SMALLEST, LARGEST, _STEPS = 1.2e-5, 0.1, 14
 
@@ -78,9 +74,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
     count = count or min(max(_rounded(found.light_paths), FEWEST), MOST)
     # Aimed photons are closer together where they show.
     worth = count / found.aim.variance if found.aim else count
-    if not radius:
-        widest = _PIXELS * _pixel_width(seen.points, sensor)
-        radius = min(radius_at(found.points, found.map, scene, worth), widest)
+    radius = radius or radius_at(found.points, found.map, scene, worth)
     return Settled(
         use=found.use,
         errors=found.errors,
@@ -102,16 +96,6 @@ def _focus(scene: Prepared, points) -> Focus | None:
     if points is None or not (scene.emission and scene.emission.from_outside):
         return None
     return find(np.array(points.p).T.astype(np.float64), 0.5 * scene.extent)
-
-
-def _pixel_width(points, sensor) -> float:
-    """Of narrow pixels at gather points (GatherPoints or None), world units; infinite where nothing
-    tells it."""
-    pixel = footprint.of(sensor, 1.0)
-    if points is None or pixel is None:
-        return math.inf
-    widths = dr.fma(pixel.spread, points.distance, pixel.start).numpy()
-    return float(np.quantile(widths, _NARROW))
 
 
 def _gather_points(scene: Prepared, rays, seed: int):
