@@ -74,11 +74,17 @@ def test_what_path_tracing_does_well_is_path_traced(variant_llvm_rgb, monkeypatc
 def test_maps_are_read_where_eye_paths_may_have_missed_caustics(variant_llvm_rgb, monkeypatch):
     """However good path tracing looks."""
     monkeypatch.setattr(survey, "_CLOSE", math.inf)
-    asked = []
-    monkeypatch.setattr(survey, "_doubt", lambda *given: asked.append(given))
+    asked, answers = [], iter((1.0, None, None))
+
+    def doubt(*given):
+        asked.append(given)
+        return next(answers)
+
+    monkeypatch.setattr(survey, "_doubt", doubt)
     found, _ = settled(ball(SKY, PLASTIC, 64))
     assert found.use != "none" and found.errors["none"] is None
-    at_once, compared = asked
+    seen, at_once, compared = asked
+    assert seen[1][0] is seen[0]  # before any map is asked
     # The light of caustics that the decision goes by is that of the map.
     assert np.mean(at_once[1]) == pytest.approx(np.mean(compared[1]), rel=0.1)
 

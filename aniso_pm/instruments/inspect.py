@@ -244,11 +244,13 @@ def as_promises(errors: dict[str, float | None]) -> str:
     if not errors:
         return "a pilot found no photon to gather"
     why = "; photons could not lessen it by much" if list(errors) == ["none"] else ""
-    missed = {"none": "finds too little of the caustics"}
-    words = [
-        f"{use} {missed.get(use, 'misses what eye paths see') if error is None else f'{error:.1e}'}"
-        for use, error in errors.items()
-    ]
+
+    def promise(use: str, error: float | None) -> str:
+        if error is not None:
+            return f"{error:.1e}"
+        return "finds too little of the caustics" if use == "none" else "misses what eye paths see"
+
+    words = [f"{use} {promise(use, error)}" for use, error in errors.items()]
     return f"relative MSE that a pilot promises: {', '.join(words)}{why}"
 
 

@@ -274,22 +274,29 @@ class _Pilot:
         plan_of = partial(self.plan_of, weight=weight, v_own=own)
         caustic = plan_of(use="caustic", work=_GOING_ON * asks * seen.work, later=going_on - own)
         left = min(plan_of(use="global", work=asks * seen.early).error, caustic.error)
-        if plan_of(use="none", later=whole - own).error > _CLOSE * left:
+
+        def close_if_maps_hold(light) -> Plan | None:
+            doubt = _doubt(seen.caustic, [light], weight)
+            if not doubt:
+                return None
+            plan = plan_of(use="none", later=going_on - own + doubt * (whole - going_on))
+            return plan if plan.error < _CLOSE * left else None
+
+        # A map is asked only where its answer decides.
+        if not close_if_maps_hold(seen.caustic):
             return None
-        light = self.reader.light(caustics(self.maps[0]), seen.points)
-        doubt = _doubt(seen.caustic, [light], weight)
-        plan = plan_of(use="none", later=going_on - own + (doubt or 1) * (whole - going_on))
-        return plan if doubt and plan.error < _CLOSE * left else None
+        return close_if_maps_hold(self.reader.light(caustics(self.maps[0]), seen.points))
 
     def _misses(self, light, found: Found, weight) -> bool:
-        """May a map be left out, and have its pilots too little of ``light``, which eye paths
-        have met?"""
+        """Have the two maps too little of ``light``, which eye paths have met, to be chosen? Not
+        where photons are needed."""
         if not self.scene.photons_are_dispensable:
             return False
         mean, as_many = _hits(light, weight)
         if mean < _NOTHING or as_many < _OFTEN:
             return False
-        return found.met_by_any < _FEW_PHOTONS or _least(found.maps, weight) < _MISSED * mean
+        least = min(_hits(each, weight)[0] for each in found.maps)
+        return found.met_by_any < _FEW_PHOTONS or least < _MISSED * mean
 
     def _of_reading(self, points) -> tuple[Found, Callable[..., Plan], Any]:
         """(what is found at the points, plans, weight of each pair) that go by all light there."""
@@ -355,16 +362,10 @@ def _pairs(sensor, tiles: Tiles, seed: int, stream: int):
 
 
 def _hits(light, weight) -> tuple[float, float]:
-    """What eye paths have met: (its mean, relative, and the number of equal hits as uneven)."""
+    """Of light of pairs: (its mean, relative, and how many hits of equal light are as uneven)."""
     hits = (light * np.sqrt(weight)[:, None]).ravel()
     squares = float((hits**2).sum())
     return float(hits.mean()), float(hits.sum()) ** 2 / squares if squares else 0.0
-
-
-def _least(maps, weight) -> float:
-    """As the mean of ``_hits``: light of that of several maps that has the least of it."""
-    root = np.sqrt(weight)[:, None]
-    return min(float((light * root).mean()) for light in maps)
 
 
 def _doubt(caustic, maps, weight) -> float | None:
@@ -372,9 +373,9 @@ def _doubt(caustic, maps, weight) -> float | None:
     hits is noisier than a few hits tell. None where too little was found to tell; 1 where there is
     next to nothing. caustic: found by eye paths; maps: light of each."""
     mean, as_many = _hits(caustic, weight)
-    there = _least([sum(maps) / len(maps)], weight)
-    if as_many >= _OFTEN:  # they tell more than a photon that one map has by luck
-        there = _least(maps, weight)
+    held = [_hits(light, weight)[0] for light in maps]
+    # Many hits tell more than a photon that one map has by luck.
+    there = min(held) if as_many >= _OFTEN else sum(held) / len(held)
     if there < _NOTHING:
         return 1.0
     if as_many < _FEWEST_HITS or mean < _FOUND * there:

@@ -16,26 +16,17 @@ from matplotlib.ticker import NullLocator
 
 from . import metrics
 
-# Okabe and Ito's colours, which everybody can tell apart.
-COLOURS = {
-    "as installed": "#E69F00",
-    "isotropic": "#0072B2",
-    "lobe": "#D55E00",
-    "taylor": "#009E73",
-    "paper": "#CC79A7",
-    "path": "#222222",
-    "ptracer": "#8a8a8a",
+# Colours of Okabe and Ito, which everybody can tell apart, and marks.
+_LOOKS = {
+    "as installed": ("#E69F00", "*"),
+    "isotropic": ("#0072B2", "o"),
+    "lobe": ("#D55E00", "s"),
+    "taylor": ("#009E73", "^"),
+    "paper": ("#CC79A7", "v"),
+    "path": ("#222222", "D"),
+    "ptracer": ("#8a8a8a", "x"),
 }
-_MORE = ("#56B4E9", "#a0522d", "#6a3d9a", "#b5a800")
-_MARKS = {
-    "as installed": "*",
-    "isotropic": "o",
-    "lobe": "s",
-    "taylor": "^",
-    "paper": "v",
-    "path": "D",
-    "ptracer": "x",
-}
+_MORE, _MORE_MARK = ("#56B4E9", "#a0522d", "#6a3d9a", "#b5a800"), "P"
 _SIZE = (5.2, 4.5)
 # Decades above the smallest error beyond which a curve leaves the picture.
 _DECADES = 3
@@ -129,7 +120,7 @@ def _ratios(scene, ratios, region) -> Figure:
         y = [r["value"] for r in mine]
         low = [v - (r["low"] or v) for v, r in zip(y, mine, strict=True)]
         high = [(r["high"] or v) - v for v, r in zip(y, mine, strict=True)]
-        colour, mark = _colour(scene, method), _MARKS.get(method["plugin"].get("rule"), "o")
+        colour, mark = _colour(scene, method), _mark(method)
         line = _line(method)
         ax.errorbar(x, y, (low, high), color=colour, lw=1.2, ls=line, capsize=2)
         for a, b, r in zip(x, y, mine, strict=True):
@@ -152,8 +143,8 @@ def _sweeps(sweeps, size) -> Figure:
         points = [(factor, error) for factor, error in sweep["errors"] if error and error > 0]
         if not points:
             continue
-        colour = COLOURS[kernel]
-        ax.plot(*zip(*points, strict=True), _MARKS[kernel] + "-", color=colour, label=kernel, ms=4)
+        colour, mark = _LOOKS[kernel]
+        ax.plot(*zip(*points, strict=True), mark + "-", color=colour, label=kernel, ms=4)
         ax.plot(*next(p for p in points if p[0] == sweep["factor"]), "*", color=colour, ms=13)
     ax.set_xscale("log", base=2)
     ax.xaxis.set_major_formatter("{x:.3g}")
@@ -181,7 +172,7 @@ def _curve(ax, method, colour, rows) -> None:
     if not rows:
         return
     line = _line(method)
-    mark = _MARKS.get(method["label"].partition(",")[0], "P")
+    mark = _mark(method)
     seconds, values = [row["seconds"] for row in rows], [row[y]["value"] for row in rows]
     if all(row[y]["low"] is not None for row in rows):
         low = [max(row[y]["low"], row[y]["value"] / 10) for row in rows]
@@ -201,12 +192,19 @@ def _line(method) -> str:
     return "--" if default else "-"
 
 
+def _named(method) -> str:
+    return method["label"].partition(",")[0]
+
+
 def _colour(scene, method) -> str:
-    name = method["label"].partition(",")[0]
-    if name in COLOURS:
-        return COLOURS[name]
-    others = [m["plugin"] for m in scene["methods"] if m["label"].partition(",")[0] not in COLOURS]
+    if _named(method) in _LOOKS:
+        return _LOOKS[_named(method)][0]
+    others = [m["plugin"] for m in scene["methods"] if _named(m) not in _LOOKS]
     return _MORE[others.index(method["plugin"]) % len(_MORE)]
+
+
+def _mark(method) -> str:
+    return _LOOKS.get(_named(method), ("", _MORE_MARK))[1]
 
 
 def _budgets(ax, entries) -> None:
