@@ -139,7 +139,7 @@ def test_what_was_chosen_survives_the_disk(tmp_path):
     per_pixel = numbers, pixels.astype(np.uint32), numbers / 7
     for kept in (
         Settled("caustic", errors, 7, 1 / 7, 3, few, None, few, None, 0.25),
-        Settled("none", {}, 0, 0.1, 1, *per_pixel, aimed, 0.0, focus),
+        Settled("none", {}, 0, 0.1, 1, *per_pixel, aimed, 0.0, focus, ("lamp",)),
     ):
         replace(state, settled=kept).save(path)
         loaded = State.load(path).settled

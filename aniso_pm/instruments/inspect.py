@@ -30,6 +30,7 @@ def examine(scene: Prepared, compile_: bool = False, spp: int = 0) -> list[Findi
     """All decisions that were taken for a scene and its integrator's parameters. Where there is a
     map a pilot is traced through the scene's first sensor, as before a rendering of ``spp``
     samples (0: those of the sampler). compile_: say what is compiled, too."""
+    asked = scene
     scene, why_map, why_aim, of_lobes = decided(scene, spp)
     needs, settings = scene.needs, scene.settings
     shown = scene.follow_lobes
@@ -55,6 +56,7 @@ def examine(scene: Prepared, compile_: bool = False, spp: int = 0) -> list[Findi
             "eye paths walk on to deeper gather points" if scene.deep else "eye paths end at once",
             mirrors or ["only Lambertian surfaces"],
         ),
+        _glossy(scene, asked),
         Finding(
             "anisotropic lobes",
             shown,
@@ -146,6 +148,20 @@ def examine(scene: Prepared, compile_: bool = False, spp: int = 0) -> list[Findi
         ),
     ]
     return [*findings, kernels(scene)] if compile_ else findings
+
+
+def _glossy(scene: Prepared, asked: Prepared) -> Finding:
+    """Caustics on glossy surfaces. asked: as before a pilot."""
+    name, needs = "caustics on glossy surfaces", scene.needs
+    if scene.glossy:
+        why = "photons there are combined with paths that meet the lamp"
+        return Finding(name, True, why, [*needs.glossy, *scene.rare])
+    if not needs.glossy or not needs.casting:
+        missing = "glossy surface" if not needs.glossy else "sharp glass or mirror"
+        return Finding(name, False, f"none: no {missing}", [])
+    if asked.rare and scene.needs_map:
+        return Finding(name, False, "left to chance: a pilot found next to none", [*asked.rare])
+    return Finding(name, False, "left to chance: paths meet the lamps often enough", needs.glossy)
 
 
 def _direct_light(scene: Prepared) -> Finding:

@@ -34,9 +34,18 @@ from ..lobe_path import LobeOnPath
 from . import index as spatial
 from . import summed
 from .gather_points import GatherPoints
+from .glossy_caustics import by_photons
 from .photon_map import PhotonMap, photon_direction, photon_flux
-from .photon_word import NORMAL_COS, faces, is_caustic, one_sheet, segments, smooth_between
-from .receivers import gathered_part
+from .photon_word import (
+    NORMAL_COS,
+    faces,
+    is_caustic,
+    is_glossy_alone,
+    one_sheet,
+    segments,
+    smooth_between,
+)
+from .receivers import gathered_part, shining_part
 from .spectra import channel_mean
 
 CUT2 = 4.0
@@ -150,7 +159,7 @@ def estimate(
         inside &= counts(word, d)
         light = photon_flux(photons, slot, inside) * dr.select(inside, dr.exp(-rho2), 0)
         if surface is not None:
-            light *= surface.brdf(photon_direction(photons, slot, inside), inside)
+            light *= surface.brdf(photons, slot, inside)
         if scores is not None:
             given = channel_mean(light * points.weight) * unit
             score = scores[1] * dr.square(given)
@@ -190,6 +199,8 @@ def _filter(points: GatherPoints, max_depth):
 
     def counts(word, d, least=NORMAL_COS):
         yes = same_surface(points, word, d, least)
+        if points.glossy is not None:
+            yes &= points.glossy | ~is_glossy_alone(word)
         if max_depth:
             yes &= segments(word) <= allowed
         if points.caustic is not None:
@@ -233,11 +244,13 @@ def photons_inside(
 
 @dataclass(frozen=True)
 class Surface:
-    """The gathered parts of the BSDFs at gather points; ``roughness`` as in ``receivers``."""
+    """The gathered parts of the BSDFs at gather points, or where ``glossy`` all of them, for glossy
+    caustics (None: nowhere); ``roughness`` as in ``receivers``."""
 
     bsdf: Any
     si: Any
     roughness: float
+    glossy: Any = None
 
     @staticmethod
     def at(scene, points: GatherPoints, roughness: float, wavelengths) -> Surface:
@@ -246,12 +259,17 @@ class Surface:
         if wavelengths is not None:
             ray.wavelengths = wavelengths
         si = scene.ray_intersect(ray)
-        return Surface(si.bsdf(ray), si, roughness)
+        return Surface(si.bsdf(ray), si, roughness, points.glossy)
 
-    def brdf(self, direction, active):
-        """BRDF value (1/sr) towards the viewer for light from a world-space direction."""
-        wo = self.si.to_local(direction)
-        value = gathered_part(self.bsdf, self.si, wo, self.roughness, active)
+    def brdf(self, photons: PhotonMap, slot, active):
+        """BRDF value (1/sr) towards the viewer for the light of the photon in a slot."""
+        wo = self.si.to_local(photon_direction(photons, slot, active))
+        gathers = active if self.glossy is None else active & ~self.glossy
+        value = gathered_part(self.bsdf, self.si, wo, self.roughness, gathers)
+        if self.glossy is not None:
+            q = dr.gather(mi.Float, photons.emitter_density, slot, active & self.glossy)
+            shining, p = shining_part(self.bsdf, self.si, wo, q > 0)
+            value += shining * by_photons(p, q)
         # Bump maps keep their value where this cosine vanishes: no more than a hundredfold.
         return value / dr.maximum(dr.abs(mi.Frame3f.cos_theta(wo)), 0.01)
 

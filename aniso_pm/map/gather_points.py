@@ -22,6 +22,7 @@ class GatherPoints:
     origin, d  ray that found p, or None where all receivers are Lambertian.
     lambertian is the receiver Lambertian? None where all are.
     caustic    only caustic photons are to be read; None where all points agree.
+    glossy     are glossy caustics seen there (see ``glossy_caustics``)? None where maps have none.
     distance   length of the path from the camera, world units; None where nobody asks.
     later      has the path left a gathered part before? (survey: then points are the caustic map's
                only.) None where nobody asks, or none has.
@@ -38,6 +39,7 @@ class GatherPoints:
     d: Any
     lambertian: Any
     caustic: Any
+    glossy: Any = None
     distance: Any = None
     later: Any = None
     wall: Any = None

@@ -29,6 +29,8 @@ class PhotonMap:
                path segments in 7, caustic or not in the highest.
     flux       W, interleaved channels, padded to a power of two.
     direction  where the light came from, 32 bits octahedral; None where no receiver needs it.
+    emitter_density  q of glossy caustics (see ``glossy_caustics``), 0 of all other photons; None
+               where there are none.
     wavelengths  nm, in spectral variants; the flux is W/nm then.
     sums       summed.Sums of the index's nodes, or None.
     origins    Origins, or None.
@@ -43,6 +45,7 @@ class PhotonMap:
     wavelengths: Any
     sums: Any = None
     origins: Origins | None = None
+    emitter_density: Any = None
 
     def numbered(self) -> PhotonMap:
         """The same for gathering alone: what differs from map to map as arrays, which are no part
@@ -83,6 +86,7 @@ class Photons:
     flux: Any
     direction: Any
     path: Any
+    emitter_density: Any = None
 
 
 def caustics(map_: PhotonMap) -> PhotonMap:
@@ -115,10 +119,18 @@ def _part(map_: PhotonMap, slot, emitted: int) -> PhotonMap:
         photon_flux(map_, slot, True),
         None if map_.direction is None else dr.gather(mi.UInt32, map_.direction, slot),
         None if map_.origins is None else dr.gather(mi.UInt32, map_.origins.path, slot),
+        None if map_.emitter_density is None else dr.gather(mi.Float, map_.emitter_density, slot),
     )
     dr.eval(photons)
     nothing = replace(
-        map_, emitted=emitted, stored=0, index=None, flux=None, direction=None, sums=None
+        map_,
+        emitted=emitted,
+        stored=0,
+        index=None,
+        flux=None,
+        direction=None,
+        sums=None,
+        emitter_density=None,
     )
     return indexed(photons, dr.width(slot), nothing)
 
@@ -133,10 +145,13 @@ def indexed(photons: Photons, stored: int, nothing: PhotonMap) -> PhotonMap:
         return nothing
     index, order = spatial.build_of([_cut(photons, name, stored) for name in ("position", "word")])
     # What has been put in order is dropped before the next column is.
-    direction, origins = None, nothing.origins
+    direction, origins, density = None, nothing.origins, None
     if photons.direction is not None:
         direction = dr.gather(mi.UInt32, _cut(photons, "direction", stored), order)
         dr.eval(direction)
+    if photons.emitter_density is not None:
+        density = dr.gather(mi.Float, _cut(photons, "emitter_density", stored), order)
+        dr.eval(density)
     if origins is not None:
         origins = replace(origins, path=dr.gather(mi.UInt32, _cut(photons, "path", stored), order))
         dr.eval(origins.path)
@@ -155,6 +170,7 @@ def indexed(photons: Photons, stored: int, nothing: PhotonMap) -> PhotonMap:
         flux=sorted_flux,
         direction=direction,
         origins=origins,
+        emitter_density=density,
     )
 
 

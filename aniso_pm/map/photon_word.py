@@ -1,6 +1,6 @@
 """What a photon's word says, 32 bits: the normal of the side that it lies on (octahedral, 24 bits),
-the number of its path's segments (7) and whether it is a caustic one (the highest); and whether
-that is the surface of another point.
+the number of its path's segments (6), whether it is there for glossy caustics alone, and whether it
+is a caustic one (the highest); and whether that is the surface of another point.
 
 Two points count as on one surface where a smooth one may go through both: on every quadric, flat or
 curved, (n + n')·d = 0 for their normals n, n' and their distance d; between parallel sheets it is
@@ -17,7 +17,9 @@ NORMAL_COS = 0.75
 # Share of their distance by which they may miss a smooth surface through both.
 BEND = 0.05
 # Segments that the word can tell apart: this number stands for itself and more.
-SEGMENTS_MAX = 127
+SEGMENTS_MAX = 63
+# Marks of photons.
+GLOSSY_ALONE, CAUSTIC = 1 << 30, 1 << 31
 
 
 def encode_normal(n):
@@ -88,4 +90,9 @@ def segments(word):
 
 def is_caustic(word):
     """Did the photon come over walked parts of BSDFs only? (Maps that mark caustics.)"""
-    return (word >> 31) != 0
+    return (word & CAUSTIC) != 0
+
+
+def is_glossy_alone(word):
+    """Is it there for glossy caustics alone (see ``glossy_caustics``)?"""
+    return (word & GLOSSY_ALONE) != 0

@@ -59,28 +59,34 @@ def may_gather(bsdf, threshold: float) -> bool:
     return _uniform(smallest) >= threshold
 
 
-def read_receiver(bsdf, si, threshold: float, general: bool, active):
-    """(is a receiver, is Lambertian, BRDF value in 1/sr of a Lambertian one, keeps photons) at si.
+def read_receiver(bsdf, si, threshold: float, general: bool, active, glossy: bool = False):
+    """(is a receiver, is Lambertian, BRDF value in 1/sr of a Lambertian one, keeps photons, shows
+    glossy caustics) at si.
 
     bsdf: mi.BSDFPtr; decided once per BSDF while tracing. The value is that of the side that si.wi
-    is on, 0 on the back of one-sided surfaces. ``general=False``: only Lambertian receivers exist.
+    is on, 0 on the back of one-sided surfaces. ``general=False``: only Lambertian receivers exist;
+    ``glossy=False``: nobody asks for glossy caustics.
     Photons are kept on the smooth texels of rough surfaces too, where nothing gathers: kernels of
     the rough ones reach over them.
     """
 
     def read(instance, si, active):
         if instance is None:  # a scene without shapes
-            return mi.Bool(False), mi.Bool(False), mi.Spectrum(0), mi.Bool(False)
+            no = mi.Bool(False)
+            return no, no, mi.Spectrum(0), no, no
         if is_lambertian(instance):
             up = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), mi.Frame3f.cos_theta(si.wi)))
             value = instance.eval(mi.BSDFContext(), si, up, active)
             # By side, not by value: kernels of lit texels reach over black ones.
             side = _reflects(instance, si)
-            return side, mi.Bool(True), value, side
+            return side, mi.Bool(True), value, side, mi.Bool(False)
         whole, diffuse = _gathered(instance, si, threshold, active) if general else (False, False)
         gathers = mi.Bool(diffuse) | whole
         keeps = mi.Bool(True) if whole is not False and _roughness_varies(instance) else gathers
-        return gathers, mi.Bool(False), mi.Spectrum(0), keeps
+        shines = mi.Bool(False)
+        if glossy and _reflects_smoothly(instance):
+            shines = _reflects(instance, si) & ~gathers
+        return gathers, mi.Bool(False), mi.Spectrum(0), keeps, shines
 
     return dr.dispatch(bsdf, read, si, active)
 
@@ -103,6 +109,40 @@ def gathered_part(bsdf, si, wo, threshold: float, active):
         if whole is not False:
             value = dr.select(whole, instance.eval(mi.BSDFContext(), si, wo, active & whole), value)
         return dr.select(active, value, 0)
+
+    return dr.dispatch(bsdf, evaluate, si, wo, active)
+
+
+def may_shine(bsdf, threshold: float) -> bool:
+    """Are there places where all of this BSDF is walked, and it reflects smoothly, and lets nothing
+    pass but straight on? Glossy caustics are seen there (see ``glossy_caustics``)."""
+    if not _reflects_smoothly(bsdf):
+        return False
+    smallest = _smallest_roughness(bsdf)
+    if smallest is None or _roughness_varies(bsdf):
+        return True
+    return not _uniform(smallest) >= threshold
+
+
+def shining_part(bsdf, si, wo, active):
+    """(BSDF times |cos θ_o|, density of sampling wo) where glossy caustics are seen."""
+
+    def evaluate(instance, si, wo, active):
+        if instance is None or not _reflects_smoothly(instance):
+            return mi.Spectrum(0), mi.Float(0)
+        active = active & (mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) > 0)
+        return instance.eval_pdf(mi.BSDFContext(), si, wo, active)
+
+    return dr.dispatch(bsdf, evaluate, si, wo, active)
+
+
+def shining_pdf(bsdf, si, wo, active):
+    """The same density alone."""
+
+    def evaluate(instance, si, wo, active):
+        if instance is None or not _reflects_smoothly(instance):
+            return mi.Float(0)
+        return instance.pdf(mi.BSDFContext(), si, wo, active)
 
     return dr.dispatch(bsdf, evaluate, si, wo, active)
 
@@ -146,6 +186,17 @@ def read_cover(bsdf, active, receivers: Container[int]):
         return mi.Bool(instance.ptr in receivers), mi.Bool(passes)
 
     return dr.dispatch(bsdf, read, active)
+
+
+def _reflects_smoothly(bsdf) -> bool:
+    """As ``may_shine``, whatever the roughness: nothing is evaluated."""
+    flags = mi.BSDFFlags
+    through = flags.DiffuseTransmission, flags.GlossyTransmission, flags.DeltaTransmission
+    if any(mi.has_flag(bsdf.flags(), flag) for flag in through):
+        return False
+    if is_lambertian(bsdf) or _diffuse_can_be_asked_for(bsdf):
+        return False
+    return mi.has_flag(bsdf.flags(), flags.Smooth)
 
 
 def _reflects(bsdf, si):

@@ -102,7 +102,9 @@ def _leaves(map_: PhotonMap) -> _Node:
         word = dr.reinterpret_array(mi.UInt32, point.w)
         normal = photon_word.decode_normal(word)
         # The last photon, again and again without flux, fills up what does not exist.
-        flux = dr.select(exists, photon_flux(map_, slot, True), 0)
+        # So do those that such sums are not asked for.
+        summed = exists & ~photon_word.is_glossy_alone(word)
+        flux = dr.select(summed, photon_flux(map_, slot, True), 0)
         x, y, z = (mi.Spectrum(c) for c in (point.x, point.y, point.z))
         steps, caustic = photon_word.segments(word), photon_word.is_caustic(word)
         return _Node(flux, x, y, z, normal, normal, steps, caustic)

@@ -34,6 +34,9 @@ class Decisions:
     hide_emitters: bool
     emission: emission.Emission | None
     chosen: Use | None = None  # use of the map that a pilot has found best, see ``undecided``
+    rare: tuple[
+        str, ...
+    ] = ()  # emitters whose caustics on glossy surfaces are photons' (``glossy``)
     lobes_matter: bool = True  # kernels that follow lobes: a pilot may find that they do not
     focus: Focus | None = None  # where light from outside begins; None: anywhere
 
@@ -66,6 +69,21 @@ class Decisions:
         return len(self.needs.chains) > 0
 
     @property
+    def glossy(self) -> bool:
+        """Are caustics on glossy surfaces the map's as well (see ``glossy_caustics``)?"""
+        return self.needs_map and bool(self.rare)
+
+    @property
+    def glossy_is_dispensable(self) -> bool:
+        """May a pilot leave them to chance? Not what emitters cast that no path meets."""
+        return not self._has_delta
+
+    @property
+    def receiving(self) -> set[int]:
+        """Addresses of the BSDFs on which photons are kept."""
+        return self.needs.receiving | (self.needs.shining if self.glossy else set())
+
+    @property
     def undecided(self) -> bool:
         """Is it for a pilot to say how the map is best used? ``map=auto`` has no choice where there
         are no surfaces that paths walk on (nothing casts caustics: path tracing is best), nor where
@@ -79,7 +97,9 @@ class Decisions:
         "global" where there is anything to choose."""
         if self.chosen:
             return self.chosen
-        wanted = bool(self.needs.receivers) and self.settings.depth_limit > self.min_segments
+        wanted = (
+            bool(self.needs.receivers) or bool(self.rare)
+        ) and self.settings.depth_limit > self.min_segments
         if not wanted or self.emission is None:
             return "none"
         if self.settings.final_gather:
@@ -94,9 +114,13 @@ class Decisions:
         (a point emits it, or a direction has all of it: what such a light sends over a mirror is
         found by photons only), and not where somebody says how many photons, or how large kernels
         are to be."""
-        delta = mi.EmitterFlags.Delta
         asked = self.settings.photon_count or self.settings.initial_radius
-        return not asked and not any(mi.has_flag(e.flags(), delta) for e in self.scene.emitters())
+        return not asked and not self._has_delta
+
+    @property
+    def _has_delta(self) -> bool:
+        delta = mi.EmitterFlags.Delta
+        return any(mi.has_flag(e.flags(), delta) for e in self.scene.emitters())
 
     @property
     def crowding(self) -> int:
@@ -106,7 +130,7 @@ class Decisions:
             return 1
         if self.use == "caustic":
             return 8
-        return 2 if self.use == "final_gather" or self.needs.general else 1
+        return 2 if self.use == "final_gather" or self.needs.general or self.glossy else 1
 
     @property
     def min_segments(self) -> int:
@@ -124,7 +148,13 @@ class Decisions:
         bytes for every leaf and every inner node (at most 2 nodes for 4 photons), which have their
         sums, too, where ``gather_tolerance`` asks for them."""
         node = 16 + (20 + flux_bytes() if self.settings.gather_tolerance else 0)
-        return 16 + flux_bytes() + (4 if self.needs.general else 0) + node // 2
+        return (
+            16
+            + flux_bytes()
+            + (4 if self.needs.general or self.glossy else 0)
+            + 4 * self.glossy
+            + node // 2
+        )
 
     @property
     def gather_depth(self) -> int:

@@ -74,9 +74,9 @@ class Wavefronts:
     def parts(self) -> dict[str, float]:
         """Bytes at the peak beyond what the process holds before, by what they are for."""
         scene, job = self.scene, self.job
-        flux, general = flux_bytes(), bool(scene.needs.general)
+        flux, general = flux_bytes(), bool(scene.needs.general) or scene.glossy
         summed = scene.settings.gather_tolerance > 0
-        per_photon = _PHOTON + (flux - 16) + general * 8 + summed * _PHOTON_SUMMED
+        per_photon = _PHOTON + (flux - 16) + (general + scene.glossy) * 8 + summed * _PHOTON_SUMMED
         per_point = _POINT + scene.follow_lobes * _POINT_LOBE + general * _POINT_GENERAL
         per_sample = _EYE_SAMPLE + _points_per_sample(scene) * (per_point + 2 * (flux - 16))
         paths = min(self.light_paths, scene.settings.photon_count) if scene.needs_map else 0
@@ -104,7 +104,8 @@ def _points_per_sample(scene: Prepared) -> float:
         return 0
     if scene.use == "caustic":
         return 6  # 4 and buffers that grew
-    return 1.2 if scene.use == "final_gather" or scene.needs.general else 1
+    mixed = scene.needs.general or scene.glossy
+    return 1.2 if scene.use == "final_gather" or mixed else 1
 
 
 def fitting(scene: Prepared, job: Job, count_photons: Callable[[], float]) -> Wavefronts:

@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..errors import Unsupported
-from ..map.receivers import has_walked_part, is_bent, is_lambertian, may_gather
+from ..map.receivers import has_walked_part, is_bent, is_lambertian, may_gather, may_shine
 from ..ndf import children, nested_bsdfs, roughness_source
 from ..transport.emission import only_photons_see
 
@@ -26,6 +26,9 @@ class Needs:
                vertex, and caustics exist.
     receivers  surfaces that photons are stored on; receiving: addresses of their BSDFs.
     general    receivers that are not Lambertian.
+    casting    surfaces with delta lobes, which cast sharp caustics.
+    glossy     surfaces on which glossy caustics are seen (see ``glossy_caustics``); shining:
+               addresses of their BSDFs.
     bent       surfaces with bump or normal maps.
     unreadable glossy surfaces whose roughness cannot be read: kernels behind them are discs.
     unseen     emitters whose direct light only photons can find.
@@ -37,6 +40,9 @@ class Needs:
     receivers: list[str] = field(default_factory=list)
     receiving: set[int] = field(default_factory=set)
     general: list[str] = field(default_factory=list)
+    casting: list[str] = field(default_factory=list)
+    glossy: list[str] = field(default_factory=list)
+    shining: set[int] = field(default_factory=set)
     bent: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
@@ -86,6 +92,12 @@ def read_scene(scene, gather_roughness: float) -> Needs:
             needs.general.append(evidence)
         if has_walked_part(bsdf, gather_roughness):
             needs.chains.append(evidence)
+        sharp = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
+        if any(mi.has_flag(bsdf.flags(), flag) for flag in sharp):
+            needs.casting.append(evidence)
+        if may_shine(bsdf, gather_roughness):
+            needs.glossy.append(evidence)
+            needs.shining.add(bsdf.ptr)
         if is_bent(bsdf):
             needs.bent.append(evidence)
         if _is_unreadable(bsdf):

@@ -86,6 +86,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
         widths=found.widths.astype(np.float32),
         aim=found.aim,
         lobes=found.lobes,
+        rare=found.rare,
         focus=focus if found.use != "none" else None,
     )
 

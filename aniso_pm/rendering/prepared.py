@@ -26,6 +26,7 @@ from .decisions import Decisions
 from .evening import Evening
 from .footprint import Footprint
 from .gathering import GatherOptions
+from .glossy import rarely_met
 from .needs import read_scene
 from .settings import Settings
 
@@ -135,6 +136,7 @@ class Prepared(Decisions):
             roughness=s.gather_roughness,
             unseen_light=bool(self.needs.unseen),
             bent=bool(self.needs.bent),
+            glossy=self.glossy,
             wavelengths=wavelengths,
             aim=self.aim,
             remember=remember,
@@ -175,6 +177,7 @@ class Prepared(Decisions):
             deep=self.deep,
             general=bool(self.needs.general),
             roughness=s.gather_roughness,
+            glossy=self.glossy,
             measure=self.footprint is not None and self.needs_map,
             thinning=thinning,
             light=for_layers and self.light_layers,
@@ -243,7 +246,7 @@ class Prepared(Decisions):
             kernel=self.kernel_options,
             max_depth=self.gather_depth,
             compensate=s.edge_compensation,
-            receiving=tuple(sorted(self.needs.receiving)) if self.deep else None,
+            receiving=tuple(sorted(self.receiving)) if self.deep else None,
             roughness=None,
             tolerance=s.gather_tolerance,
             use=self.use,
@@ -333,7 +336,10 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
     needs = read_scene(scene, settings.gather_roughness)
     source = emission.prepare(scene) if scene.emitters() else None
     lamps, direct = Lamps.of(scene), DirectLight.of(scene, source)
-    prepared = Prepared(scene, needs, settings, hide_emitters, source, lamps=lamps, direct=direct)
+    rare = tuple(rarely_met(scene, needs, settings.gather_roughness))
+    prepared = Prepared(
+        scene, needs, settings, hide_emitters, source, rare=rare, lamps=lamps, direct=direct
+    )
     radius, extent = settings.initial_radius, prepared.extent
     if radius and scene.shapes() and not 1e-7 * extent <= radius <= 10 * extent:
         raise Unsupported(

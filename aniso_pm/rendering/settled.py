@@ -34,6 +34,7 @@ class Settled:
     aim     of light paths (aim.Learned), or None: they begin evenly.
     lobes   part of the error that kernels make which follow lobes (see ``plan``).
     focus   where light from outside begins, or None: anywhere.
+    rare    emitters whose caustics on glossy surfaces are photons' (see ``glossy``).
     """
 
     use: Use
@@ -47,6 +48,7 @@ class Settled:
     aim: aim.Learned | None
     lobes: float
     focus: Focus | None = None
+    rare: tuple[str, ...] = ()
 
     def applied(self, scene: Prepared) -> Prepared:
         """The scene with the use of its map, with or without lobes, and with the number and aim of
@@ -54,7 +56,7 @@ class Settled:
         matter = scene.worth_following(self.lobes)
         aimed = self.aim.aim() if self.aim else None
         scene = scene.focused(self.focus)
-        scene = replace(scene, chosen=self.use, aim=aimed, lobes_matter=matter)
+        scene = replace(scene, chosen=self.use, aim=aimed, rare=self.rare, lobes_matter=matter)
         return scene.with_(photon_count=self.count)
 
     def packed(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -77,4 +79,5 @@ class Settled:
         if values["focus"]:
             centre, radius = values["focus"]["centre"], values["focus"]["radius"]
             values["focus"] = Focus(tuple(centre), radius)
+        values["rare"] = tuple(values["rare"])
         return Settled(**values)

@@ -66,6 +66,9 @@ _OFTEN, _MISSED, _FEW_PHOTONS = 16, 0.5, 64
 # Path tracing comes close where it promises so many times the error that is left to eye paths, at
 # the most: with what photons cost, and with their noise, errors were 1.9 to 50 times as large.
 _CLOSE = 1.5
+# Chance with which eye paths meet lamps in glossy caustics, about. Photons for these are worth
+# their time where such a part of the variance goes: they make passes dearer by a tenth or two.
+_CHANCE, _LITTLE = 0.1, 0.1
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ class Survey:
     counts       samples of each pixel (see ``allotment``), or None: all alike.
     widths       of the kernels of each pixel, in pixels.
     aim          of light paths (aim.Learned), or None: they begin evenly.
+    rare         glossy caustics are photons' (``Decisions.rare``).
     lobes        part of the error that kernels make which follow lobes.
     map, points  a map of that use, and where eye paths read it (GatherPoints); None where none do.
     """
@@ -94,6 +98,7 @@ class Survey:
     counts: np.ndarray | None
     widths: np.ndarray
     aim: aim.Learned | None
+    rare: tuple[str, ...]
     lobes: float
     map: PhotonMap | None
     points: Any
@@ -105,7 +110,7 @@ class Seen:
 
     own      light that every use leaves to eye paths.
     later    light that the global map has, the caustic one not.
-    caustic  light that both have.
+    caustic  light that both have; glossy: the part of it that is glossy caustics.
     work     of the whole path; early: of the path up to its first gathered part.
     points   where they gather, or None.
     tiles    of the pairs.
@@ -114,6 +119,7 @@ class Seen:
     own: np.ndarray
     later: np.ndarray
     caustic: np.ndarray
+    glossy: np.ndarray
     work: np.ndarray
     early: np.ndarray
     points: Any
@@ -139,14 +145,14 @@ def look(scene: Prepared, sensor, seed: int) -> Seen:
 
     room = 3 * tiles.lanes if scene.use == "survey" else 0
     L, _, points = scene.trace(sampler, ray, room, watch=watch)
-    later = caustic = mi.Float(0)
+    later = caustic = glossy = mi.Float(0)
     if isinstance(L, Parts):
-        L, later, caustic = L.radiance, L.later, L.caustic
+        L, later, caustic, glossy = L.radiance, L.later, L.caustic, L.glossy
     none = dr.zeros(mi.Float, tiles.lanes)
-    later, caustic = pairwise(later + none), pairwise(caustic + none)
+    later, caustic, glossy = (pairwise(v + none) for v in (later, caustic, glossy))
     own = pairwise(channel_mean(L) + none) - later
     work, early = (_VERTEX * pairwise(v).mean(1) + _CAMERA for v in (vertices, early))
-    return Seen(own, later, caustic, work, early, points, tiles)
+    return Seen(own, later, caustic + glossy, glossy, work, early, points, tiles)
 
 
 def decide(
@@ -184,8 +190,8 @@ def decide(
         whole=seen.work,
     )
     reader = Reader(scene, sensor, radius, seed, tiles.lanes)
-    pilot = _Pilot(scene, sensor, seed, seen, maps, reader, plan_of)
-    if seen.points is None or not min(map_.stored for map_ in maps):
+    pilot = _Pilot(scene, sensor, seed, seen, maps, reader, plan_of).with_or_without_glossy()
+    if pilot.seen.points is None or not min(map_.stored for map_ in maps):
         return pilot.nothing_to_read()
     return pilot.best_use() if scene.use == "survey" else pilot.given_use()
 
@@ -206,6 +212,27 @@ class _Pilot:
     maps: Any
     reader: Reader
     plan_of: Callable[..., Plan]
+
+    def with_or_without_glossy(self) -> _Pilot:
+        """The same, without photons for glossy caustics where they would lessen the variance of eye
+        paths by little. What meets lamps by chance has the variance L²/chance; L is asked of a map,
+        because a pilot's paths may not have met any."""
+        seen, scene = self.seen, self.scene
+        if not scene.rare or not scene.glossy_is_dispensable:
+            return self
+        light = seen.own + seen.later + seen.caustic
+        weight = seen.tiles.weight(light)
+        points = seen.points and take(seen.points, dr.compress(seen.points.glossy))
+        if points is not None and dr.width(points.lane) and self.maps[0].stored:
+            held = self.reader.light(self.maps[0], points)
+            saved = float((weight[:, None] * held**2).mean()) / _CHANCE
+            if saved >= _LITTLE * float(within(light, light, weight).mean()):
+                return self
+        points = seen.points and take(seen.points, dr.compress(~seen.points.glossy))
+        own, caustic = seen.own + seen.glossy, seen.caustic - seen.glossy
+        seen = replace(seen, own=own, caustic=caustic, points=points)
+        scene = replace(scene, rare=())
+        return replace(self, seen=seen, scene=scene, reader=replace(self.reader, scene=scene))
 
     def nothing_to_read(self) -> Survey:
         """No path reads a map, or a map is empty."""
@@ -320,6 +347,7 @@ class _Pilot:
             counts=pixel_counts(plan, self.scene, self.sensor, self.seed),
             widths=widths,
             aim=plan.aim,
+            rare=self.scene.rare if plan.use != "none" else (),
             lobes=plan.lobes,
             map=map_,
             points=points,

@@ -50,7 +50,7 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
 def _room_at_first(options: WalkOptions, paths: int, expected: int) -> int:
     """Entries of the columns of gather points."""
     # Without mixed receivers a path ends where it leaves its first gather point.
-    single = options.use == "global" and not options.general
+    single = options.use == "global" and not options.general and not options.glossy
     return paths if single else max(2 * paths, expected + expected // 8)
 
 
@@ -81,9 +81,10 @@ def _point(o: WalkOptions, v: Vertex) -> GatherPoints:
         weight=v.weight,
         depth=v.depth,
         path=v.path,
-        origin=v.ray.o if o.general else None,
-        d=v.ray.d if o.general else None,
-        lambertian=v.lambertian if o.general else None,
+        origin=v.ray.o if o.general or o.glossy else None,
+        d=v.ray.d if o.general or o.glossy else None,
+        lambertian=v.lambertian if o.general or o.glossy else None,
+        glossy=v.glossy if o.glossy else None,
         caustic=~v.scattered if o.use == "final_gather" else None,
         distance=v.distance if o.measure else None,
         later=v.scattered if o.use == "survey" or (o.light and o.use != "global") else None,
@@ -94,4 +95,4 @@ def _blank(o: WalkOptions) -> GatherPoints:
     si, ray = dr.zeros(mi.SurfaceInteraction3f), dr.zeros(mi.Ray3f)
     no, zero = mi.Bool(False), mi.UInt32(0)
     lobe = first_lobe(o)
-    return _point(o, Vertex(zero, si, ray, mi.Spectrum(0), zero, lobe, no, no, mi.Float(0)))
+    return _point(o, Vertex(zero, si, ray, mi.Spectrum(0), zero, lobe, no, no, no, mi.Float(0)))

@@ -50,4 +50,6 @@ def split(
     if unseen:
         direct = part(replace(points, depth=mi.UInt32(0)), 1)
     over_walked, direct = (dr.select(later, 0, x) for x in (over_walked, direct))
+    if points.glossy is not None:  # has met no gathered part
+        over_walked, direct = (dr.select(points.glossy, L, x) for x in (over_walked, direct))
     return Light(direct, over_walked - direct, L - over_walked)

@@ -33,8 +33,9 @@ import numpy as np
 
 from .. import arrays
 from ..map import index as spatial
+from ..map.glossy_caustics import emitter_density, seen_from
 from ..map.photon_map import Origins, PhotonMap, Photons, indexed
-from ..map.photon_word import SEGMENTS_MAX, encode, encode_normal
+from ..map.photon_word import CAUSTIC, GLOSSY_ALONE, SEGMENTS_MAX, encode, encode_normal
 from ..map.receivers import gathered_part, read_bent, read_receiver
 from ..map.spectra import channel_mean
 from .aim import Aim
@@ -59,6 +60,7 @@ class TraceOptions:
     roughness     smallest alpha that is gathered on.
     unseen_light  the scene has direct light that only photons can find.
     bent          the scene has bump or normal maps.
+    glossy        keep photons for caustics on glossy surfaces (see ``glossy_caustics``).
     wavelengths   nm, of all photons (spectral variants), else None.
     aim           aim.Aim, where light paths do not begin evenly.
     remember      the map is to know where its light paths began (PhotonMap.origins).
@@ -71,6 +73,7 @@ class TraceOptions:
     roughness: float
     unseen_light: bool
     bent: bool
+    glossy: bool = False
     wavelengths: Any = None
     aim: Aim | None = None
     remember: bool = False
@@ -122,8 +125,9 @@ def _trace(scene, source, photon_count, seed, options, capacity, launch, wavefro
             arrays.room(mi.Point3f, capacity),
             arrays.room(mi.UInt32, capacity),
             arrays.room(mi.Spectrum, capacity),
-            arrays.room(mi.UInt32, capacity) if options.general else None,
+            arrays.room(mi.UInt32, capacity) if options.general or options.glossy else None,
             arrays.room(mi.UInt32, capacity) if options.remember else None,
+            arrays.room(mi.Float, capacity) if options.glossy else None,
         )
         stored, rejected = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0)
         room = dr.opaque(mi.UInt32, capacity)
@@ -170,13 +174,15 @@ def light_paths(scene, source, sampler, share, options, photons, stored, rejecte
     def reject(active):
         dr.scatter_add(rejected, mi.UInt32(1), mi.UInt32(0), active)
 
-    def store(position, word, flux, direction, path, active):
+    def store(position, word, flux, direction, path, density, active):
         slot = dr.scatter_inc(stored, mi.UInt32(0), active)
         active = active & (slot < room)
         dr.scatter(photons.position, position, slot, active)
         dr.scatter(photons.word, word, slot, active)
         dr.scatter(photons.flux, flux, slot, active)
-        if options.general:
+        if options.glossy:
+            dr.scatter(photons.emitter_density, density, slot, active)
+        if options.general or options.glossy:
             dr.scatter(photons.direction, encode(direction, 16), slot, active)
         if options.remember:
             dr.scatter(photons.path, path, slot, active)
@@ -192,7 +198,7 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
     max_depth, rr_depth = dr.opaque(mi.UInt32, o.max_depth), dr.opaque(mi.UInt32, o.rr_depth)
     reach = dr.opaque(mi.Float, reach_of(scene))
 
-    ray, emitted, path, shortest, finite = _leave_emitter(source, sampler, share, o)
+    ray, emitted, emitter, path, shortest, finite = _leave_emitter(source, sampler, share, o)
     reject(~finite)
     ray = mi.Ray3f(ray)  # Current ray
     β = mi.Spectrum(1)  # Path throughput, shading-normal corrections included
@@ -200,6 +206,11 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
     depth = mi.UInt32(1)  # Path segments up to the next vertex
     caustic = mi.Bool(True)  # Walked parts of BSDFs only, so far
     active = finite & (dr.max(emitted) > 0)
+    delta_only = mi.Bool(True)  # Delta lobes only, so far
+    length = mi.Float(0)  # Of the path
+    density, per_area = mi.Float(0), mi.Bool(False)  # Of drawing its beginning
+    if dr.hint(o.glossy, mode="scalar"):
+        density, per_area = emitter_density(emitter, -ray.d, active)
 
     while dr.hint(active, label="light paths"):
         # --- Find the next vertex ---
@@ -215,23 +226,35 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
         same_side = (dr.dot(-ray.d, n) * mi.Frame3f.cos_theta(si.wi)) > 0
 
         # --- Leave a photon ---
-        is_receiver, lambertian, _, keeps = read_receiver(bsdf, si, o.roughness, o.general, active)
+        is_receiver, lambertian, _, keeps, glossy = read_receiver(
+            bsdf, si, o.roughness, o.general, active, o.glossy
+        )
         power = emitted * β * (wi_s / wi_n)
         deposit = active & keeps & same_side & (depth >= shortest)
         if dr.hint(o.caustics == "only", mode="scalar"):
             deposit &= caustic
+        seen_directly = mi.Float(0)
+        if dr.hint(o.glossy, mode="scalar"):
+            length += dr.select(active, si.t, 0)
+            glossy &= active & same_side & delta_only & (depth >= 2)
+            seen_directly = dr.select(glossy, seen_from(density, per_area, length), 0)
+        received = deposit
+        deposit |= glossy
         finite = dr.all(dr.isfinite(power))
         reject(deposit & ~finite)
         deposit &= finite & (dr.max(power) > 0)
         side = dr.mulsign(mi.Normal3f(n), dr.dot(-ray.d, n))
         word = encode_normal(side) | (dr.minimum(depth, SEGMENTS_MAX) << 24)
         if dr.hint(o.caustics == "marked", mode="scalar"):
-            word |= dr.select(caustic, mi.UInt32(1 << 31), mi.UInt32(0))
-        store(si.p, word, power, -ray.d, path, deposit)
+            word |= dr.select(caustic, mi.UInt32(CAUSTIC), mi.UInt32(0))
+        if dr.hint(o.glossy, mode="scalar"):
+            word |= dr.select(received, mi.UInt32(0), mi.UInt32(GLOSSY_ALONE))
+        store(si.p, word, power, -ray.d, path, seen_directly, deposit)
 
         # --- Scatter ---
         active &= depth < max_depth
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        delta_only &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         bent = mi.Bool(False)
         if dr.hint(o.bent, mode="scalar"):
             bent = read_bent(bsdf, active)
@@ -274,8 +297,8 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
 
 
 def _leave_emitter(source, sampler, share, o):
-    """(ray, flux, number of the path, segments of the shortest path that is stored, is the flux
-    finite?) of every path."""
+    """(ray, flux, emitter, number of the path, segments of the shortest path that is stored, is the
+    flux finite?) of every path."""
     numbers = _first_numbers(sampler)
     path = dr.arange(mi.UInt32, dr.width(numbers[0]))
     worth = mi.Float(1)
@@ -287,7 +310,7 @@ def _leave_emitter(source, sampler, share, o):
     shortest = mi.UInt32(2)
     if o.unseen_light:
         shortest = dr.select(only_photons_see(emitter), mi.UInt32(1), mi.UInt32(2))
-    return ray, emitted, path, shortest, dr.all(dr.isfinite(emitted))
+    return ray, emitted, emitter, path, shortest, dr.all(dr.isfinite(emitted))
 
 
 def _gathered_share(si, bsdf, bs, roughness, mixed):

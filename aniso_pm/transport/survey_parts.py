@@ -23,18 +23,20 @@ class Parts:
     later     the part of it that was found beyond a gathered part, which the global map has:
               radiance in the mean over channels.
     caustic   what was found over walked parts beyond a gathered part, which both maps have.
+    glossy    what they have of glossy caustics; None where they have none.
     """
 
     radiance: Any
     later: Any
     caustic: Any
+    glossy: Any
 
 
 @dataclass
 class Apart:
     """What one path keeps, one lane a path.
 
-    later, caustic  see ``Parts``.
+    later, caustic, glossy  see ``Parts``.
     throughput  of emission at the next vertex over walked parts beyond a gathered one.
     before      had the path left a gathered part before its last vertex?
     """
@@ -43,15 +45,20 @@ class Apart:
     caustic: Any
     throughput: Any
     before: Any
+    glossy: Any
 
     @staticmethod
     def begin() -> Apart:
-        return Apart(mi.Float(0), mi.Float(0), mi.Spectrum(0), mi.Bool(False))
+        return Apart(mi.Float(0), mi.Float(0), mi.Spectrum(0), mi.Bool(False), mi.Float(0))
 
     def emission(self, emission, β, active):
         """Emission found at a vertex, weighted. β: throughput with which the picture gets it."""
         self.later[active & self.before] += channel_mean(β * emission)
         self.caustic[active & self.before] += channel_mean(self.throughput * emission)
+
+    def leave_to_maps(self, radiance, active):
+        """Light that maps have on glossy surfaces (see ``glossy_caustics``)."""
+        self.glossy[active] += channel_mean(radiance)
 
     def direct_light(self, light, f, whole, active):
         """Light by emitter sampling where the path has left a gathered part. f, whole: value of the
@@ -66,4 +73,4 @@ class Apart:
         self.throughput = dr.select(scattered, β_walked, 0)
 
     def parts(self, radiance) -> Parts:
-        return Parts(radiance, self.later, self.caustic)
+        return Parts(radiance, self.later, self.caustic, self.glossy)

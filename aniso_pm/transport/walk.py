@@ -15,9 +15,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..lobe_path import GlossyVertex, follow, no_lobe
-from ..map.receivers import gathered_part, read_receiver
+from ..map.receivers import gathered_part, read_receiver, shining_pdf
 from ..map.spectra import channel_mean
 from . import layers
+from .chain import Chain
 from .direct_light import DirectLight
 from .lamps import Lamps
 from .rays import reach_of, spawn_ray
@@ -41,6 +42,7 @@ class WalkOptions:
     deep           the scene has surfaces to walk on (``needs.chains``).
     general        the scene has receivers that are not Lambertian (``needs.general``).
     roughness      smallest alpha that is gathered on.
+    glossy         caustics on glossy surfaces are photons' too (see ``glossy_caustics``).
     measure        keep the length of the path at gather points.
     thinning       which paths leave gather points; None: all do.
     light          split light by how it came (see ``layers``).
@@ -59,6 +61,7 @@ class WalkOptions:
     deep: bool
     general: bool
     roughness: float
+    glossy: bool = False
     measure: bool = False
     thinning: Thinning | None = None
     light: bool = False
@@ -76,6 +79,7 @@ class Vertex(NamedTuple):
     path        GlossyVertex, where lobes are followed.
     lambertian  is its BSDF?
     scattered   has the path left a gathered part before?
+    glossy      are glossy caustics seen there?
     distance    from the camera along the path, where that is measured.
     """
 
@@ -87,6 +91,7 @@ class Vertex(NamedTuple):
     path: GlossyVertex | None
     lambertian: Any
     scattered: Any
+    glossy: Any
     distance: Any
 
 
@@ -125,6 +130,7 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
     path = first_lobe(o)
     distance = mi.Float(0)  # Length of the path
     trail = layers.begin(o.light, o.surface)  # What it keeps for layers, if anybody asks
+    chain = Chain.begin() if o.glossy else None  # Since the last vertex that was not a delta lobe
     apart = Apart.begin() if o.use == "survey" else None  # What the survey tells apart
     chosen, worth = mi.Bool(True), mi.Float(1)  # Does the path gather, and for how many others?
     if dr.hint(o.thinning is not None, mode="scalar"):
@@ -145,6 +151,12 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
         pdf_emitter = _light_pdf(scene, o.direct, si_prev, chances, ds, seen & ~delta_prev)
         mis = dr.select(delta_prev, 1, _power_heuristic(pdf_prev, pdf_emitter))
         emission = mis * ds.emitter.eval(si, seen)
+        if dr.hint(chain is not None, mode="scalar"):
+            chain.length += dr.select(active & si.is_valid(), si.t, 0)
+            chance = chain.weight(ds, seen)
+            if dr.hint(apart is not None, mode="scalar"):
+                apart.leave_to_maps(β_direct * emission * (1 - chance), seen)
+            emission *= chance
         L[seen] = dr.fma(β_direct, emission, L)
         if dr.hint(trail is not None, mode="scalar"):
             trail.emission(β_direct * emission, seen)
@@ -171,10 +183,13 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
             trail.direct_light(o.use, bsdf, si, wo, f * light, f, o.roughness, scattered, lit)
 
         # --- Leave a gather point ---
-        is_receiver, lambertian, brdf, _ = read_receiver(bsdf, si, o.roughness, o.general, active)
+        is_receiver, lambertian, brdf, _, shines = read_receiver(
+            bsdf, si, o.roughness, o.general, active, o.glossy
+        )
         is_receiver &= active
         weight = dr.select(lambertian, β * brdf, β)
-        here = is_receiver & (depth + o.min_segments <= max_depth)
+        shines &= active & ~scattered
+        here = (is_receiver | shines) & (depth + o.min_segments <= max_depth)
         finite = dr.all(dr.isfinite(weight))
         here &= dr.max(weight) != 0
         if dr.hint(o.follow_lobes, mode="scalar"):
@@ -185,7 +200,9 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
             L[here & ~finite] = dr.nan  # counted and dropped later
             here &= chosen
             weight *= worth
-            vertex = Vertex(lane, si, ray, weight, depth, path, lambertian, scattered, distance)
+            vertex = Vertex(
+                lane, si, ray, weight, depth, path, lambertian, scattered, shines, distance
+            )
             leave(vertex, here & finite)
 
         # --- Sample the BSDF ---
@@ -203,6 +220,10 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
         valid |= on_surface & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         ray = spawn_ray(si, si.to_world(bs.wo), reach)
         β, β_direct, scattered = _go_on(o, sampler, β * weight, g, scattered, active, apart)
+        if dr.hint(chain is not None, mode="scalar"):
+            shines &= ~scattered & ~delta
+            pdf = shining_pdf(bsdf, si, bs.wo, shines)
+            chain.leave(shines, pdf, delta, active)
         η *= bs.eta
         si_prev = mi.Interaction3f(si)
         pdf_prev = bs.pdf

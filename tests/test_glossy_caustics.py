@@ -1,0 +1,231 @@
+"""Caustics on glossy surfaces: photons and paths that meet lamps share them; nothing is lost."""
+
+from dataclasses import replace
+
+import aniso_pm  # noqa: F401  (before drjit, so that it can choose LLVM)  # isort: skip
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from aniso_pm.map import glossy_caustics
+from aniso_pm.rendering import pilot
+from aniso_pm.rendering.glossy import rarely_met
+from aniso_pm.rendering.needs import read_scene
+from aniso_pm.rendering.prepared import prepare
+from aniso_pm.rendering.settings import Settings
+from conftest import slow
+from renders import array
+
+POINT = {"type": "point", "position": [0.6, 1.6, 4], "intensity": {"type": "rgb", "value": 20}}
+METAL = {"type": "roughconductor", "alpha_u": 0.15, "alpha_v": 0.12}
+PRINCIPLED = {"type": "principled", "roughness": 0.4, "metallic": 0.5}
+GRAY = {"type": "diffuse"}
+
+
+def lamp(radius):
+    """A sphere that sends as much light as the point does."""
+    radiance = 20 / (np.pi * radius**2)
+    return {
+        "type": "sphere",
+        "center": [0.6, 1.6, 4],
+        "radius": radius,
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+    }
+
+
+def plate(light, bsdf=METAL, size=24):
+    """A glass ball over a plate, in front of nothing."""
+    T = mi.ScalarTransform4f
+    return {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective",
+            "fov": 32,
+            "to_world": T().look_at(origin=[0, -4, 3.2], target=[0, -0.2, 0], up=[0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+        },
+        "light": light,
+        "plate": {
+            "type": "rectangle",
+            "to_world": T().scale(1.5),
+            "bsdf": {"type": "twosided", "bsdf": bsdf},
+        },
+        "ball": {
+            "type": "sphere",
+            "center": [0.1, 0.3, 1.3],
+            "radius": 0.5,
+            "bsdf": {"type": "dielectric"},
+        },
+    }
+
+
+def pictures(scene, integrator, spp, seeds=1):
+    integrator = mi.load_dict(integrator)
+    render = lambda seed: mi.render(scene, integrator=integrator, spp=spp, seed=seed)  # noqa: E731
+    return [array(render(seed)) for seed in range(seeds)]
+
+
+def picture(scene, integrator, spp, seeds=1):
+    return np.mean(pictures(scene, integrator, spp, seeds), 0)
+
+
+def below_the_ball(image):
+    """Where the caustic is, and the ball is not: light tracing does not see that."""
+    return float(image[image.shape[0] * 14 // 32 :].mean())
+
+
+def test_weights_of_both_ways_add_up_to_one(variant_llvm_rgb):
+    p, q = np.meshgrid(10.0 ** np.arange(-6, 7), 10.0 ** np.arange(-6, 16))
+    p, q = (mi.Float(v.ravel().astype(np.float32)) for v in (p, q))
+    chance, photons = glossy_caustics.by_chance(p, q), glossy_caustics.by_photons(p, q)
+    np.testing.assert_allclose((chance + photons).numpy(), 1, rtol=1e-6)
+    # Veach's power heuristic, in double precision.
+    exact = p.numpy().astype(float) ** 2
+    exact /= exact + q.numpy().astype(float) ** 2
+    np.testing.assert_allclose(chance.numpy(), exact, rtol=1e-5, atol=1e-30)
+    assert glossy_caustics.by_photons(mi.Float(3), mi.Float(0))[0] == 0  # came another way
+
+
+def test_density_of_drawing_a_lamp(variant_llvm_rgb):
+    """1/A, the environment's own, more than anything for points."""
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": 1}}
+    scene = mi.load_dict({"type": "scene", "a": lamp(0.5), "b": POINT, "c": sky})
+    found = {}
+    for emitter in scene.emitters():
+        of = dr.gather(mi.EmitterPtr, scene.emitters_dr(), scene.emitters().index(emitter))
+        density, per_area = glossy_caustics.emitter_density(of, mi.Vector3f(0, 0, 1), True)
+        found[emitter.class_name()] = density[0], per_area[0]
+    assert found["AreaLight"] == (pytest.approx(1 / np.pi), True)
+    assert found["PointLight"] == (pytest.approx(1e15), False)
+    assert found["ConstantBackgroundEmitter"] == (pytest.approx(1 / (4 * np.pi)), False)
+    at_two = glossy_caustics.seen_from(mi.Float(3), mi.Bool(True), mi.Float(2))
+    assert at_two[0] == 12
+
+
+@pytest.mark.parametrize("bsdf", [METAL, *slow(PRINCIPLED)], ids=["metal", "principled"])
+def test_what_a_point_casts_on_metal_is_that_of_light_tracing(variant_llvm_rgb, bsdf):
+    """``path`` cannot see it."""
+    scene = mi.load_dict(plate(POINT, bsdf))
+    expected = below_the_ball(picture(scene, {"type": "ptracer"}, 8000, 3))
+    found = below_the_ball(picture(scene, {"type": "aniso_pm"}, 512))
+    seen_by_path = below_the_ball(picture(scene, {"type": "path"}, 64))
+    assert seen_by_path < 0.8 * expected
+    assert found == pytest.approx(expected, rel=0.015)
+
+
+USES = {
+    "auto": {},
+    "global": {"map": "global"},
+    "caustic": {"map": "caustic"},
+    "final_gather": {"final_gather": True},
+    "sums": {"map": "global", "gather_tolerance": 0.05},
+    "narrow": {"map": "global", "initial_radius": 0.01},
+}
+
+
+@pytest.fixture(scope="module")
+def seen_by_path():
+    """The plate under a lamp, by path tracing."""
+    before = mi.variant()
+    mi.set_variant("llvm_ad_rgb")
+    scene = mi.load_dict(plate(lamp(0.25)))
+    yield scene, picture(scene, {"type": "path"}, 4096, 4)
+    if before:
+        mi.set_variant(before)
+
+
+@pytest.mark.parametrize("use", ["auto", "caustic", *slow(*(u for u in USES if u != "caustic"))])
+def test_energy_is_that_of_path(variant_llvm_rgb, seen_by_path, use):
+    scene, expected = seen_by_path
+    prepared = prepare(scene, Settings(**USES[use]), False)
+    assert pilot.settle(prepared, scene.sensors()[0], 0, 64).rare
+    found = picture(scene, {"type": "aniso_pm", **USES[use]}, 256, 4)
+    assert found.mean() == pytest.approx(expected.mean(), rel=0.006)
+    assert below_the_ball(found) == pytest.approx(below_the_ball(expected), rel=0.006)
+
+
+def test_photons_lessen_noise(variant_llvm_rgb, seen_by_path):
+    scene, expected = seen_by_path
+    noise = {
+        name: np.mean([(image - expected) ** 2 for image in pictures(scene, {"type": name}, 32, 4)])
+        for name in ("aniso_pm", "path")
+    }
+    assert noise["aniso_pm"] < 0.2 * noise["path"]
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_other_variants(variant, request):
+    request.getfixturevalue(f"variant_{variant.replace('_ad', '')}")
+    scene = mi.load_dict(plate(lamp(0.25), size=16))
+    expected = picture(scene, {"type": "path"}, 4096, 2)
+    found = picture(scene, {"type": "aniso_pm"}, 512, 2)
+    assert found.mean() == pytest.approx(expected.mean(), rel=0.015)
+
+
+def test_photons_on_metal_are_not_the_floors(variant_llvm_rgb):
+    """The left half of the plate is diffuse, in one plane with the metal; with sums of photons,
+    too. What its kernels spill over the metal is compensated."""
+    T = mi.ScalarTransform4f
+    definition = plate(lamp(0.25))
+    half = T().scale([0.75, 1.5, 1])
+    definition["plate"]["to_world"] = T().translate([0.75 + 0.1, 0, 0]) @ half
+    floor = {"type": "rectangle", "bsdf": {"type": "twosided", "bsdf": GRAY}}
+    definition["floor"] = floor | {"to_world": T().translate([-0.75 + 0.1, 0, 0]) @ half}
+    scene = mi.load_dict(definition)
+    expected = picture(scene, {"type": "path"}, 4096, 2)
+    diffuse = np.s_[10:, :13]
+    for tolerance in (0.0, 0.05):
+        integrator = {"type": "aniso_pm", "map": "global", "gather_tolerance": tolerance}
+        found = picture(scene, integrator, 256, 2)
+        assert found.mean() == pytest.approx(expected.mean(), rel=0.01)
+        assert found[diffuse].mean() == pytest.approx(expected[diffuse].mean(), rel=0.01)
+
+
+def rare(definition, roughness=0.2):
+    scene = mi.load_dict(definition)
+    return rarely_met(scene, read_scene(scene, roughness), roughness)
+
+
+def test_which_lamps_are_rarely_met(variant_llvm_rgb):
+    """Small ones, points, and the sun; not those that fill the lobes of the metal."""
+    assert rare(plate(lamp(0.25))) and rare(plate(POINT))
+    assert not rare(plate(lamp(0.4)))
+    assert rare(plate(lamp(0.4), METAL | {"alpha_u": 0.19, "alpha_v": 0.19}))
+    assert not rare(plate({"type": "constant"}))
+    assert rare(plate({"type": "sunsky", "sun_direction": [0, 0.3, 1]}))
+    assert rare(plate({"type": "directional", "direction": [0, 0, -1]}))
+
+
+def test_nobody_asks_without_glass_or_gloss(variant_llvm_rgb):
+    assert not rare(plate(POINT, GRAY))
+    assert not rare(plate(POINT, METAL | {"alpha_u": 0.3, "alpha_v": 0.3}))  # gathers by itself
+    assert rare(plate(POINT, METAL | {"alpha_u": 0.3, "alpha_v": 0.3}), roughness=0.4)
+    without = plate(POINT)
+    without["ball"]["bsdf"] = GRAY
+    assert not rare(without)
+
+
+def test_a_pilot_leaves_them_out_where_they_hardly_show(variant_llvm_rgb):
+    """But what a point casts is nobody else's."""
+    definition = plate(lamp(0.25), GRAY)
+    aside = {"type": "sphere", "center": [0, 0, -3], "radius": 0.2, "bsdf": METAL}
+    for light, kept in ((lamp(0.25), False), (POINT, True)):
+        scene = mi.load_dict(definition | {"light": light, "aside": aside})
+        prepared = prepare(scene, Settings(), False)
+        assert prepared.glossy
+        found = pilot.settle(prepared, scene.sensors()[0], 0, 16)
+        assert bool(found.rare) == kept
+        assert found.applied(prepared).glossy == kept
+    # What is left out takes nothing.
+    plain = replace(prepared, rare=())
+    assert plain.bytes_per_photon < prepared.bytes_per_photon
+    assert not plain.receiving >= prepared.receiving
+
+
+def test_light_that_metal_shows_is_direct(variant_llvm_rgb):
+    """It has met no gathered part (see ``layers``)."""
+    scene = mi.load_dict(plate(POINT))
+    plugin = mi.load_dict({"type": "aniso_pm", "layers": "direct, caustic, indirect"})
+    image = array(mi.render(scene, integrator=plugin, spp=64))
+    np.testing.assert_allclose(plugin.layers["direct"], image[..., :3], rtol=1e-4, atol=1e-5)
+    assert plugin.layers["caustic"].max() == plugin.layers["indirect"].max() == 0
