@@ -79,11 +79,6 @@ class Decisions:
         return not self._has_delta
 
     @property
-    def receiving(self) -> set[int]:
-        """Addresses of the BSDFs on which photons are kept."""
-        return self.needs.receiving | (self.needs.shining if self.glossy else set())
-
-    @property
     def undecided(self) -> bool:
         """Is it for a pilot to say how the map is best used? ``map=auto`` has no choice where there
         are no surfaces that paths walk on (nothing casts caustics: path tracing is best), nor where

@@ -215,8 +215,8 @@ class Prepared(Decisions):
             o = replace(o, light=self.light_layers, radius=wanted)
         map_, seed = map_.numbered(), dr.opaque(mi.UInt32, seed)
 
-        def gather(some, roughness=None):
-            options = replace(o, roughness=roughness)
+        def gather(some, **changes):
+            options = replace(o, **changes)
             scored = None
             if scores:
                 # A weight for each point: Dr.Jit traces anew where sizes of arrays coincide or not.
@@ -231,11 +231,19 @@ class Prepared(Decisions):
 
         if points.lambertian is None:
             return [gather(points)]
+        kinds: list[tuple[Any, dict[str, Any]]] = [(points.lambertian, {})]
+        roughness = self.settings.gather_roughness
+        glossy: Any = mi.Bool(False) if points.glossy is None else points.glossy
+        if self.needs.general:
+            kinds.append((~points.lambertian & ~glossy, {"roughness": roughness}))
+        if points.glossy is not None:
+            shining = tuple(sorted(self.needs.shining))
+            kinds.append((glossy, {"roughness": roughness, "receiving": shining}))
         parts = []
-        for roughness in (None, self.settings.gather_roughness):
-            index = dr.compress(points.lambertian == (roughness is None))
+        for some, changes in kinds:
+            index = dr.compress(some)
             if dr.width(index):
-                parts.append(gather(take(points, index), roughness))
+                parts.append(gather(take(points, index), **changes))
         return parts
 
     @property
@@ -246,7 +254,7 @@ class Prepared(Decisions):
             kernel=self.kernel_options,
             max_depth=self.gather_depth,
             compensate=s.edge_compensation,
-            receiving=tuple(sorted(self.receiving)) if self.deep else None,
+            receiving=tuple(sorted(self.needs.receiving)) if self.deep else None,
             roughness=None,
             tolerance=s.gather_tolerance,
             use=self.use,

@@ -238,7 +238,7 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
             length += dr.select(active, si.t, 0)
             glossy &= active & same_side & delta_only & (depth >= 2)
             seen_directly = dr.select(glossy, seen_from(density, per_area, length), 0)
-        received = deposit
+        received = mi.Bool(deposit)  # not the same array, which changes in place
         deposit |= glossy
         finite = dr.all(dr.isfinite(power))
         reject(deposit & ~finite)
