@@ -68,7 +68,7 @@ _OFTEN, _MISSED, _FEW_PHOTONS = 16, 0.5, 64
 _CLOSE = 1.5
 # Chance with which eye paths meet lamps in glossy caustics, about. Photons for these are worth
 # their time where such a part of the variance goes: they make passes dearer by a tenth or two.
-_CHANCE, _LITTLE = 0.1, 0.1
+_CHANCE, _LITTLE = 0.1, 0.03
 
 
 @dataclass(frozen=True)
