@@ -9,7 +9,15 @@ from aniso_pm import cli
 from aniso_pm.instruments import gallery
 from aniso_pm.instruments.report import reference as references
 
-NAMES = ["brushed_wall", "far_close", "fry_pan", "glass_balls", "plain_room", "teapot"]
+NAMES = [
+    "brushed_tray",
+    "brushed_wall",
+    "far_close",
+    "fry_pan",
+    "glass_balls",
+    "plain_room",
+    "teapot",
+]
 # Sizes that reports use, where they are not the scene's own
 SMALL = {name: {"width": "160", "height": "120"} for name in ("teapot", "fry_pan")}
 

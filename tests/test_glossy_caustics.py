@@ -238,3 +238,26 @@ def test_light_that_metal_shows_is_direct(variant_llvm_rgb):
     image = array(mi.render(scene, integrator=plugin, spp=64))
     np.testing.assert_allclose(plugin.layers["direct"], image[..., :3], rtol=1e-4, atol=1e-5)
     assert plugin.layers["caustic"].max() == plugin.layers["indirect"].max() == 0
+
+
+def test_kernels_on_smooth_texels_reach_over_rough_ones(variant_llvm_rgb):
+    """Photons for them are kept on all: kernels are wider than texels here."""
+    alpha = {
+        "type": "checkerboard",
+        "color0": {"type": "rgb", "value": 0.12},
+        "color1": {"type": "rgb", "value": 0.3},
+        "to_uv": mi.ScalarTransform4f().scale([40, 40, 1]),
+    }
+    means = []
+    for roughness in (alpha, 0.12):
+        scene = mi.load_dict(plate(POINT, {"type": "roughconductor", "alpha": roughness}))
+        settings = Settings(map="global", photon_count=100_000, initial_radius=0.2)
+        prepared = prepare(scene, settings, False)
+        map_ = prepared.photon_map(0, 0)
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(0, 4096)
+        points = prepared.trace(sampler, pilot.camera_rays(scene.sensors()[0], 0))[2]
+        found = prepared.gather(map_, dr.opaque(mi.Float, 0.2), 0, points)
+        # Light of the mean gather point: those on smooth texels are the last.
+        means.append(found[-1].radiance.numpy().mean())
+    assert means[0] == pytest.approx(means[1], rel=0.1)

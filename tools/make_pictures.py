@@ -1,13 +1,15 @@
-"""Make ``scenes/pictures``: ``python tools/make_pictures.py comparison gallery bandwidth``.
+"""Make ``scenes/pictures``: ``python tools/make_pictures.py WHAT ...``.
 
 comparison  teapot and pan as the scenes have them, with both kernels, beside their references.
 gallery     all references.
 bandwidth   how large the kernels behind each pixel are, beside the picture.
+as_installed  the brushed tray by path and by the integrator without parameters, in equal seconds.
 
 Prints what it measures. Needs matplotlib, which the extra ``dev`` brings.
 """
 
 import argparse
+import time
 from pathlib import Path
 
 import aniso_pm  # noqa: F401
@@ -83,10 +85,11 @@ def gallery():
         reference = references.read(path)
         if reference.mean.shape == (120, 160, 3):
             found[path.stem.removesuffix("_160x120")] = reference
-    figure, axes = plt.subplots(2, 3, figsize=(9.6, 5.3), dpi=100, facecolor="white")
-    for ax, (name, reference) in zip(axes.flat, found.items(), strict=True):
+    figure, axes = plt.subplots(2, 4, figsize=(12.8, 5.3), dpi=100, facecolor="white")
+    for ax, (name, reference) in zip(axes.flat, found.items(), strict=False):
         ax.imshow(srgb(0.8 * reference.mean / np.percentile(reference.mean, 95)))
         ax.set_title(f"{name} (own error {100 * reference.own_error:.1f} %)", fontsize=10)
+    for ax in axes.flat:
         ax.set_axis_off()
     figure.tight_layout(pad=0.4)
     figure.savefig(SCENES / "pictures" / "gallery.png", dpi=100, pil_kwargs={"optimize": True})
@@ -123,9 +126,47 @@ def bandwidth():
     figure.savefig(SCENES / "pictures" / "bandwidth.png", dpi=75, pil_kwargs={"optimize": True})
 
 
+def as_installed(seconds=5.0):
+    """Both integrators with the scene's sampler; compilation is not counted."""
+    from matplotlib import pyplot as plt
+
+    name = "brushed_tray"
+    scene = mi.load_file(str(SCENES / f"{name}.xml"), optimize=False)
+    reference = references.read(SCENES / "references" / f"{name}.exr")
+    for seed in (1, 2):
+        began = time.perf_counter()
+        render(scene, {"type": "path"}, 64, seed)
+    samples = int(64 * seconds / (time.perf_counter() - began))
+    ours = {"type": "aniso_pm", "time": seconds}
+    render(scene, ours, 0, 1)
+    columns = []
+    for title, plugin, spp in (("path", {"type": "path"}, samples), ("aniso_pm", ours, 0)):
+        began = time.perf_counter()
+        image, plugin = render(scene, plugin, spp, 3)
+        took = time.perf_counter() - began
+        spp = spp or plugin.statistics["spp"]
+        error = 100 * relative_rmse(image - reference.mean, reference.mean)
+        columns.append((f"{title}, {took:.1f} s: relative RMSE {error:.1f} %", image))
+        print(
+            f"{name} {title}: {took:.2f} s, {spp} samples, relative RMSE {error:.2f} %, "
+            f"mean-energy ratio {image.mean() / reference.mean.mean():.4f}"
+        )
+    own = f"path, reference (own error {100 * reference.own_error:.1f} %)"
+    columns.append((own, reference.mean))
+    figure, axes = plt.subplots(1, 3, figsize=(12.8, 3.5), dpi=100, facecolor="white")
+    scale = 1 / np.percentile(reference.mean, 98)
+    for ax, (title, image) in zip(axes, columns, strict=True):
+        ax.imshow(srgb(scale * image), interpolation="nearest")
+        ax.set_title(title, fontsize=11)
+        ax.set_axis_off()
+    figure.tight_layout(pad=0.4)
+    path = SCENES / "pictures" / "as_installed.png"
+    figure.savefig(path, dpi=100, pil_kwargs={"optimize": True})
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    makers = {maker.__name__: maker for maker in (comparison, gallery, bandwidth)}
+    makers = {maker.__name__: maker for maker in (comparison, gallery, bandwidth, as_installed)}
     parser.add_argument("what", nargs="+", choices=list(makers))
     mi.set_variant("llvm_ad_rgb")
     for name in parser.parse_args().what:

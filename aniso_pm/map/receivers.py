@@ -59,15 +59,15 @@ def may_gather(bsdf, threshold: float) -> bool:
     return _uniform(smallest) >= threshold
 
 
-def read_receiver(bsdf, si, threshold: float, general: bool, active, glossy: bool = False):
+def read_receiver(bsdf, si, threshold: float, general: bool, active, glossy: str = ""):
     """(is a receiver, is Lambertian, BRDF value in 1/sr of a Lambertian one, keeps photons, shows
     glossy caustics) at si.
 
     bsdf: mi.BSDFPtr; decided once per BSDF while tracing. The value is that of the side that si.wi
-    is on, 0 on the back of one-sided surfaces. ``general=False``: only Lambertian receivers exist;
-    ``glossy=False``: nobody asks for glossy caustics.
+    is on, 0 on the back of one-sided surfaces. ``general=False``: only Lambertian receivers exist.
     Photons are kept on the smooth texels of rough surfaces too, where nothing gathers: kernels of
-    the rough ones reach over them.
+    the rough ones reach over them. So do kernels of the smooth ones in glossy caustics, which are
+    seen "here", or "somewhere" on the surface; "": nobody asks.
     """
 
     def read(instance, si, active):
@@ -85,7 +85,10 @@ def read_receiver(bsdf, si, threshold: float, general: bool, active, glossy: boo
         keeps = mi.Bool(True) if whole is not False and _roughness_varies(instance) else gathers
         shines = mi.Bool(False)
         if glossy and _reflects_smoothly(instance):
-            shines = _reflects(instance, si) & ~gathers
+            varies = whole is not False and _roughness_varies(instance)
+            shines = _reflects(instance, si)
+            if glossy == "here" or not varies:
+                shines &= ~gathers
         return gathers, mi.Bool(False), mi.Spectrum(0), keeps, shines
 
     return dr.dispatch(bsdf, read, si, active)

@@ -227,7 +227,7 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
 
         # --- Leave a photon ---
         is_receiver, lambertian, _, keeps, glossy = read_receiver(
-            bsdf, si, o.roughness, o.general, active, o.glossy
+            bsdf, si, o.roughness, o.general, active, "somewhere" if o.glossy else ""
         )
         power = emitted * β * (wi_s / wi_n)
         deposit = active & keeps & same_side & (depth >= shortest)

@@ -184,7 +184,7 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
 
         # --- Leave a gather point ---
         is_receiver, lambertian, brdf, _, shines = read_receiver(
-            bsdf, si, o.roughness, o.general, active, o.glossy
+            bsdf, si, o.roughness, o.general, active, "here" if o.glossy else ""
         )
         is_receiver &= active
         weight = dr.select(lambertian, β * brdf, β)
