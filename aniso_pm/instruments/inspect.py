@@ -84,7 +84,8 @@ def examine(scene: Prepared, compile_: bool = False, spp: int = 0) -> list[Findi
             bool(needs.general),
             "photons keep directions; the BSDF is evaluated for each"
             if needs.general
-            else "no directions are stored, one BRDF value a gather point",
+            else "one BRDF value a gather point, no directions"
+            + (" but for glossy caustics" if scene.glossy else ""),
             needs.general or ["all receivers are Lambertian"],
         ),
         Finding(
