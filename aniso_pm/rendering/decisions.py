@@ -34,9 +34,7 @@ class Decisions:
     hide_emitters: bool
     emission: emission.Emission | None
     chosen: Use | None = None  # use of the map that a pilot has found best, see ``undecided``
-    rare: tuple[
-        str, ...
-    ] = ()  # emitters whose caustics on glossy surfaces are photons' (``glossy``)
+    rare: tuple[str, ...] = ()  # emitters whose caustics are photons' on glossy surfaces, too
     lobes_matter: bool = True  # kernels that follow lobes: a pilot may find that they do not
     focus: Focus | None = None  # where light from outside begins; None: anywhere
 
@@ -92,9 +90,8 @@ class Decisions:
         "global" where there is anything to choose."""
         if self.chosen:
             return self.chosen
-        wanted = (
-            bool(self.needs.receivers) or bool(self.rare)
-        ) and self.settings.depth_limit > self.min_segments
+        read = bool(self.needs.receivers or self.rare)
+        wanted = read and self.settings.depth_limit > self.min_segments
         if not wanted or self.emission is None:
             return "none"
         if self.settings.final_gather:
@@ -139,17 +136,13 @@ class Decisions:
 
     @property
     def bytes_per_photon(self) -> int:
-        """Of a map at rest, index included: position and word, flux, direction, and one box of 16
-        bytes for every leaf and every inner node (at most 2 nodes for 4 photons), which have their
-        sums, too, where ``gather_tolerance`` asks for them."""
+        """Of a map at rest, index included: position and word, flux, direction, density, and one
+        box of 16 bytes for every leaf and every inner node (at most 2 nodes for 4 photons), which
+        have their sums, too, where ``gather_tolerance`` asks for them."""
         node = 16 + (20 + flux_bytes() if self.settings.gather_tolerance else 0)
-        return (
-            16
-            + flux_bytes()
-            + (4 if self.needs.general or self.glossy else 0)
-            + 4 * self.glossy
-            + node // 2
-        )
+        direction = 4 if self.needs.general or self.glossy else 0
+        density = 4 if self.glossy else 0
+        return 16 + flux_bytes() + direction + density + node // 2
 
     @property
     def gather_depth(self) -> int:

@@ -46,6 +46,8 @@ def _is_rare(emitter, shapes) -> bool:
         density = _of_environment(emitter)
         return any(p < OFTEN * density for _, p in shapes)
     shape = emitter.get_shape()
+    if shape is None:
+        return False
     area, middle = float(mi.Float(shape.surface_area())[0]), _middle(shape)
     away = ((p, np.sum((place - middle) ** 2)) for place, p in shapes)
     return any(p * area < OFTEN * squared for p, squared in away)

@@ -23,7 +23,7 @@ class Parts:
     later     the part of it that was found beyond a gathered part, which the global map has:
               radiance in the mean over channels.
     caustic   what was found over walked parts beyond a gathered part, which both maps have.
-    glossy    what they have of glossy caustics; None where they have none.
+    glossy    what they have of glossy caustics.
     """
 
     radiance: Any

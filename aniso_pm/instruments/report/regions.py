@@ -17,8 +17,8 @@ DEFINITIONS = {
     ANISOTROPIC: "pixels where at least half of the eye samples gather with a kernel that follows "
     "the lobe of an anisotropic surface",
     CAUSTIC: "pixels that owe at least a quarter of their light (that of the reference) to the "
-    "caustic photon map: light that came over glass, mirrors or glossy metal to a diffuse surface, or "
-    "over glass and mirrors to metal",
+    "caustic photon map: light that came over glass, mirrors or glossy metal to a diffuse surface, "
+    "or over glass and mirrors to metal",
 }
 # Pixels that are darker than so much of the mean have caustics by the blur of a kernel alone.
 _DARK = 0.01
