@@ -254,12 +254,13 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
         # --- Scatter ---
         active &= depth < max_depth
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
-        delta_only &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         bent = mi.Bool(False)
         if dr.hint(o.bent, mode="scalar"):
             bent = read_bent(bsdf, active)
             bs, bent_weight = bent_bounce(ctx, bsdf, si, bs, weight, sampler, bent)
             weight = dr.select(bent, bent_weight, weight)
+        if dr.hint(o.glossy, mode="scalar"):
+            delta_only &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         wo = si.to_world(bs.wo)
         wo_n, wo_s = dr.dot(wo, n), mi.Frame3f.cos_theta(bs.wo)
         # A reflection through the geometric surface would leak, and its correction has no bound.
