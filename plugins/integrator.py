@@ -91,9 +91,9 @@ class AnisoPhotonMapper:
      * - gather_roughness
        - |float|
        - Roughness from which on a glossy surface is a receiver (each of its alphas has to be as
-         large), with its BSDF evaluated for every photon; below it paths go on, and only caustics
-         of small lamps are photons' too. At least 0.01; a large number leaves receivers to diffuse
-         surfaces and components. (Default: 0.2)
+         large), with its BSDF evaluated for every photon; below it paths go on, and only sharp
+         caustics are photons' too (where lamps are small, from 0.01 on). At least 0.01; a large
+         number leaves receivers to diffuse surfaces and components. (Default: 0.2)
 
      * - photon_count
        - |int|

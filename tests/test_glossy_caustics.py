@@ -90,10 +90,11 @@ def test_density_of_drawing_a_lamp(variant_llvm_rgb):
     """1/A, the environment's own, more than anything for points."""
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": 1}}
     scene = mi.load_dict({"type": "scene", "a": lamp(0.5), "b": POINT, "c": sky})
+    drawn = glossy_caustics.EmitterDensity.of(scene)
     found = {}
     for emitter in scene.emitters():
         of = dr.gather(mi.EmitterPtr, scene.emitters_dr(), scene.emitters().index(emitter))
-        density, per_area = glossy_caustics.emitter_density(of, mi.Vector3f(0, 0, 1), True)
+        density, per_area = drawn.at(of, mi.Vector3f(0, 0, 1), True)
         found[emitter.class_name()] = density[0], per_area[0]
     assert found["AreaLight"] == (pytest.approx(1 / np.pi), True)
     assert found["PointLight"] == (pytest.approx(1e15), False)
@@ -229,6 +230,39 @@ def test_a_pilot_leaves_them_out_where_they_hardly_show(variant_llvm_rgb):
         assert found.applied(prepared).glossy == kept
     # What is left out takes nothing.
     assert replace(prepared, rare=()).bytes_per_photon < prepared.bytes_per_photon
+
+
+def test_shapes_that_do_not_know_their_area_are_not_asked(variant_llvm_rgb):
+    """Instances and curves, in this scene and in another one that is alive."""
+    T = mi.ScalarTransform4f
+    group = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.1, "bsdf": METAL}}
+    instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    definition = plate(POINT, size=12) | {
+        "group": group,
+        "instance": instance | {"to_world": T().translate([0.8, -0.4, 0.2])},
+    }
+    scene = mi.load_dict(definition)
+    assert prepare(scene, Settings(), False).glossy
+    with_it = picture(scene, {"type": "aniso_pm"}, 64)
+    without = picture(mi.load_dict(plate(POINT, size=12)), {"type": "aniso_pm"}, 64)
+    assert np.isfinite(with_it).all()
+    assert with_it.mean() == pytest.approx(without.mean(), rel=0.15)
+
+
+@pytest.mark.parametrize("use", ["global", "caustic"])
+def test_a_camera_that_sees_glass_and_metal_alone(variant_llvm_rgb, use):
+    """A pilot that leaves out photons on metal has nothing left to read."""
+    definition = plate(lamp(0.25), size=12)
+    definition["ball"]["to_world"] = mi.ScalarTransform4f().translate([0, 0, 30])
+    scene = mi.load_dict(definition)
+    prepared = prepare(scene, Settings(map=use), False)
+    assert prepared.glossy
+    assert not pilot.settle(prepared, scene.sensors()[0], 0, 16).rare
+
+
+def test_narrow_lobes_are_left_to_paths(variant_llvm_rgb):
+    assert rare(plate(POINT, METAL | {"alpha_u": 0.012, "alpha_v": 0.012}))
+    assert not rare(plate(POINT, METAL | {"alpha_u": 0.008, "alpha_v": 0.012}))
 
 
 def test_light_that_metal_shows_is_direct(variant_llvm_rgb):

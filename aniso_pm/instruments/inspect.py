@@ -160,7 +160,9 @@ def _glossy(scene: Prepared, asked: Prepared) -> Finding:
     if not needs.glossy or not needs.casting:
         missing = "glossy surface" if not needs.glossy else "sharp glass or mirror"
         return Finding(name, False, f"none: no {missing}", [])
-    if asked.rare and scene.needs_map:
+    if asked.rare and not scene.needs_map:
+        return Finding(name, False, "left to chance: the scene is path traced", [*asked.rare])
+    if asked.rare:
         return Finding(name, False, "left to chance: a pilot found next to none", [*asked.rare])
     return Finding(name, False, "left to chance: paths meet the lamps often enough", needs.glossy)
 

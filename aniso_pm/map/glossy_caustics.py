@@ -20,28 +20,64 @@ say which way has less noise: how many photons there are is left out.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+from ..arrays import own
 
 # Stands for infinity, and can be squared.
 _DELTA = 1e15
 
 
-def emitter_density(emitter, direction, active) -> tuple[Any, Any]:
-    """(1/A or the density of a direction or _DELTA, is that per area?) of mi.EmitterPtr; direction:
-    to the emitter."""
-    flags = emitter.flags()
-    far = mi.has_flag(flags, mi.EmitterFlags.Infinite)
-    delta = mi.has_flag(flags, mi.EmitterFlags.Delta)
-    ds = dr.zeros(mi.DirectionSample3f)
-    ds.d = direction
-    of_direction = emitter.pdf_direction(dr.zeros(mi.Interaction3f), ds, active & far & ~delta)
-    area = emitter.get_shape().surface_area()
-    per_area = ~far & ~delta
-    density = dr.select(far, of_direction, dr.rcp(area))
-    return dr.select(delta, _DELTA, dr.minimum(density, _DELTA)), per_area
+@dataclass  # not frozen: Dr.Jit traverses it
+class EmitterDensity:
+    """What q of a scene's emitters follows from.
+
+    column      1/A of lamps, _DELTA of points and directions, else 0; by registry number, because
+                a call for the area would ask all shapes there are, and not all of them know it.
+    surrounded  the scene has an environment.
+    """
+
+    column: Any
+    surrounded: bool
+
+    @staticmethod
+    def of(scene) -> EmitterDensity:
+        """Evaluates the areas of lamps."""
+        ids = dr.reinterpret_array(mi.UInt32, scene.emitters_dr()).numpy()
+        column = np.zeros(ids.max() + 1, np.float32)
+        column[ids] = [_of_surface(emitter) for emitter in scene.emitters()]
+        return EmitterDensity(own(mi.Float, column), scene.environment() is not None)
+
+    def at(self, emitter, direction, active) -> tuple[Any, Any]:
+        """(density, is it per area?) of mi.EmitterPtr; direction: to the emitter."""
+        number = dr.reinterpret_array(mi.UInt32, emitter)
+        density = dr.gather(mi.Float, self.column, number, active)
+        per_area = density < _DELTA
+        if self.surrounded:
+            far = active & emitter.is_environment()
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.d = direction
+            of_direction = emitter.pdf_direction(dr.zeros(mi.Interaction3f), ds, far)
+            density = dr.select(far, dr.minimum(of_direction, _DELTA), density)
+            per_area &= ~far
+        return density, per_area
+
+
+def _of_surface(emitter) -> float:
+    if mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta):
+        return _DELTA
+    shape = emitter.get_shape()
+    return 1 / lamp_area(shape) if shape is not None else 0.0
+
+
+def lamp_area(shape) -> float:
+    """World units squared, above 0."""
+    return max(float(mi.Float(shape.surface_area())[0]), 1 / _DELTA)
 
 
 def seen_from(density, per_area, length):
@@ -55,5 +91,5 @@ def by_chance(p, q):
 
 
 def by_photons(p, q):
-    """1 − w; 0 where q is 0, which marks photons that came another way."""
+    """1 − w; 0 where q is 0: no such lamp, or a photon that came another way."""
     return dr.select(q > 0, dr.rcp(1 + dr.square(p / q)), 0)

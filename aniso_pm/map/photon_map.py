@@ -25,8 +25,7 @@ class PhotonMap:
     emitted    light paths traced: the estimate divides by it.
     stored     photons in the map; 0 means that the arrays are None (but see ``numbered``).
     rejected   fluxes that were not finite and were dropped: photons, and light paths that end.
-    index      index.Index, or None. The word of a point: octahedral normal in 24 bits, number of
-               path segments in 7, caustic or not in the highest.
+    index      index.Index, or None. The word of a point: see ``photon_word``.
     flux       W, interleaved channels, padded to a power of two.
     direction  where the light came from, 32 bits octahedral; None where no receiver needs it.
     emitter_density  q of glossy caustics (see ``glossy_caustics``), 0 of all other photons; None

@@ -22,6 +22,9 @@ import mitsuba as mi
 
 from ..ndf import ROUGHNESS, children, clearcoat_roughness, nested_bsdfs, own_roughness
 
+# Roughness from which photons are summed up in glossy caustics: lobes of smoother surfaces are so
+# narrow that next to no photon lies in them. As the smallest ``gather_roughness``.
+_SHINES_FROM = 0.01
 _WRAPPERS = ("TwoSidedBRDF", "BlendBSDF", "MaskBSDF", "BumpMap", "NormalMap")
 # BSDFs that evaluate exactly the components that BSDFContext.type_mask asks for.
 _OBEYS_TYPE_MASK = (
@@ -87,6 +90,9 @@ def read_receiver(bsdf, si, threshold: float, general: bool, active, glossy: str
         if glossy and _reflects_smoothly(instance):
             varies = whole is not False and _roughness_varies(instance)
             shines = _reflects(instance, si)
+            smallest = _smallest_roughness(instance)
+            if smallest is not None:
+                shines &= smallest(si, active) >= _SHINES_FROM
             if glossy == "here" or not varies:
                 shines &= ~gathers
         return gathers, mi.Bool(False), mi.Spectrum(0), keeps, shines
@@ -124,7 +130,7 @@ def may_shine(bsdf, threshold: float) -> bool:
     smallest = _smallest_roughness(bsdf)
     if smallest is None or _roughness_varies(bsdf):
         return True
-    return not _uniform(smallest) >= threshold
+    return _SHINES_FROM <= _uniform(smallest) < threshold
 
 
 def shining_part(bsdf, si, wo, active):
@@ -134,7 +140,8 @@ def shining_part(bsdf, si, wo, active):
         if instance is None or not _reflects_smoothly(instance):
             return mi.Spectrum(0), mi.Float(0)
         active = active & (mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) > 0)
-        return instance.eval_pdf(mi.BSDFContext(), si, wo, active)
+        value, pdf = instance.eval_pdf(mi.BSDFContext(), si, wo, active)
+        return mi.Spectrum(dr.select(active, value, 0)), dr.select(active, pdf, 0)
 
     return dr.dispatch(bsdf, evaluate, si, wo, active)
 

@@ -145,7 +145,7 @@ def _word(node: _Node):
     middle = node.low + node.high
     middle = dr.select(dr.squared_norm(middle) > 0, middle, mi.Normal3f(0, 0, 1))
     word = photon_word.encode_normal(middle) | (node.segments << 24)
-    return word | dr.select(node.caustic, mi.UInt32(1 << 31), mi.UInt32(0))
+    return word | dr.select(node.caustic, mi.UInt32(photon_word.CAUSTIC), mi.UInt32(0))
 
 
 def weighed(sums: Sums, node, ellipses: Ellipses, cut2, counts, tolerance):

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import one_line
+from ..map.glossy_caustics import lamp_area
 from ..map.receivers import may_shine
 from ..ndf import roughness_source
 from .needs import Needs, emitter_name, surfaces
@@ -48,7 +49,7 @@ def _is_rare(emitter, shapes) -> bool:
     shape = emitter.get_shape()
     if shape is None:
         return False
-    area, middle = float(mi.Float(shape.surface_area())[0]), _middle(shape)
+    area, middle = lamp_area(shape), _middle(shape)
     away = ((p, np.sum((place - middle) ** 2)) for place, p in shapes)
     return any(p * area < OFTEN * squared for p, squared in away)
 

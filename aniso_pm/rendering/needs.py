@@ -26,7 +26,7 @@ class Needs:
                vertex, and caustics exist.
     receivers  surfaces that photons are stored on; receiving: addresses of their BSDFs.
     general    receivers that are not Lambertian.
-    casting    surfaces with delta lobes, which cast sharp caustics.
+    casting    surfaces with delta lobes (or cut-outs), which cast sharp caustics.
     glossy     surfaces on which glossy caustics are seen (see ``glossy_caustics``); shining:
                addresses of their BSDFs.
     bent       surfaces with bump or normal maps.
@@ -92,8 +92,7 @@ def read_scene(scene, gather_roughness: float) -> Needs:
             needs.general.append(evidence)
         if has_walked_part(bsdf, gather_roughness):
             needs.chains.append(evidence)
-        sharp = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
-        if any(mi.has_flag(bsdf.flags(), flag) for flag in sharp):
+        if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta):
             needs.casting.append(evidence)
         if may_shine(bsdf, gather_roughness):
             needs.glossy.append(evidence)

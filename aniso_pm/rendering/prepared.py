@@ -13,6 +13,7 @@ import mitsuba as mi
 from ..errors import Unsupported
 from ..map import density, summed
 from ..map.gather_points import GatherPoints, take
+from ..map.glossy_caustics import EmitterDensity
 from ..map.photon_map import EMPTY, PhotonMap
 from ..transport import emission, eye, layers, photons
 from ..transport.aim import Aim
@@ -75,6 +76,7 @@ class Prepared(Decisions):
     footprint: Footprint | None = None  # of pixels; None: one bandwidth for all of a pass
     aim: Aim | None = None  # of light paths, if a pilot has found that it pays
     lamps: Lamps | None = None  # where emitters are; None: anywhere
+    drawn: EmitterDensity | None = None  # density of drawing emitters, where ``rare``
     direct: DirectLight | None = None  # how emitters are drawn; None: as Mitsuba does
 
     def with_(self, **changes) -> Prepared:
@@ -136,7 +138,7 @@ class Prepared(Decisions):
             roughness=s.gather_roughness,
             unseen_light=bool(self.needs.unseen),
             bent=bool(self.needs.bent),
-            glossy=self.glossy,
+            glossy=self.drawn if self.glossy else None,
             wavelengths=wavelengths,
             aim=self.aim,
             remember=remember,
@@ -177,7 +179,7 @@ class Prepared(Decisions):
             deep=self.deep,
             general=bool(self.needs.general),
             roughness=s.gather_roughness,
-            glossy=self.glossy,
+            glossy=self.drawn if self.glossy else None,
             measure=self.footprint is not None and self.needs_map,
             thinning=thinning,
             light=for_layers and self.light_layers,
@@ -348,6 +350,8 @@ def prepare(scene, settings: Settings, hide_emitters: bool) -> Prepared:
     prepared = Prepared(
         scene, needs, settings, hide_emitters, source, rare=rare, lamps=lamps, direct=direct
     )
+    if rare:
+        prepared = replace(prepared, drawn=EmitterDensity.of(scene))
     radius, extent = settings.initial_radius, prepared.extent
     if radius and scene.shapes() and not 1e-7 * extent <= radius <= 10 * extent:
         raise Unsupported(

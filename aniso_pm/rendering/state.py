@@ -29,7 +29,7 @@ from .digest import differences
 from .layered import develop
 from .settled import Settled
 
-VERSION = 2
+VERSION = 3
 _N = TypeVar("_N", int, float)
 _OPTIONAL = ("layers", "denoising")
 _CHOSEN = "chosen, "

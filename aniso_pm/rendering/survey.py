@@ -228,7 +228,8 @@ class _Pilot:
             saved = float((weight[:, None] * held**2).mean()) / _CHANCE
             if saved >= _LITTLE * float(within(light, light, weight).mean()):
                 return self
-        points = seen.points and take(seen.points, dr.compress(~seen.points.glossy))
+        others = seen.points and dr.compress(~seen.points.glossy)
+        points = take(seen.points, others) if seen.points and dr.width(others) else None
         own, caustic = seen.own + seen.glossy, seen.caustic - seen.glossy
         seen = replace(seen, own=own, caustic=caustic, points=points)
         scene = replace(scene, rare=())

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..map.glossy_caustics import by_chance, emitter_density, seen_from
+from ..map.glossy_caustics import EmitterDensity, by_chance, seen_from
 
 
 @dataclass
@@ -30,10 +30,10 @@ class Chain:
     def begin() -> Chain:
         return Chain(mi.Bool(False), mi.Bool(False), mi.Float(1), mi.Float(0))
 
-    def weight(self, ds, active):
+    def weight(self, drawn: EmitterDensity, ds, active):
         """w of emission that has been met (mi.DirectionSample3f)."""
         active = active & self.glossy & self.bent
-        density, per_area = emitter_density(ds.emitter, ds.d, active)
+        density, per_area = drawn.at(ds.emitter, ds.d, active)
         q = seen_from(density, per_area, self.length)
         return dr.select(active, by_chance(self.pdf, q), 1)
 

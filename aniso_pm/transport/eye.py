@@ -50,7 +50,7 @@ def trace(scene, sampler, ray, options: WalkOptions, expected: int = 0, launch=N
 def _room_at_first(options: WalkOptions, paths: int, expected: int) -> int:
     """Entries of the columns of gather points."""
     # Without mixed receivers a path ends where it leaves its first gather point.
-    single = options.use == "global" and not options.general and not options.glossy
+    single = options.use == "global" and not options.general and options.glossy is None
     return paths if single else max(2 * paths, expected + expected // 8)
 
 

@@ -33,7 +33,7 @@ import numpy as np
 
 from .. import arrays
 from ..map import index as spatial
-from ..map.glossy_caustics import emitter_density, seen_from
+from ..map.glossy_caustics import EmitterDensity, seen_from
 from ..map.photon_map import Origins, PhotonMap, Photons, indexed
 from ..map.photon_word import CAUSTIC, GLOSSY_ALONE, SEGMENTS_MAX, encode, encode_normal
 from ..map.receivers import gathered_part, read_bent, read_receiver
@@ -60,7 +60,8 @@ class TraceOptions:
     roughness     smallest alpha that is gathered on.
     unseen_light  the scene has direct light that only photons can find.
     bent          the scene has bump or normal maps.
-    glossy        keep photons for caustics on glossy surfaces (see ``glossy_caustics``).
+    glossy        density of drawing emitters, where photons are kept for glossy caustics (see
+                  ``glossy_caustics``); else None.
     wavelengths   nm, of all photons (spectral variants), else None.
     aim           aim.Aim, where light paths do not begin evenly.
     remember      the map is to know where its light paths began (PhotonMap.origins).
@@ -73,7 +74,7 @@ class TraceOptions:
     roughness: float
     unseen_light: bool
     bent: bool
-    glossy: bool = False
+    glossy: EmitterDensity | None = None
     wavelengths: Any = None
     aim: Aim | None = None
     remember: bool = False
@@ -209,8 +210,8 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
     delta_only = mi.Bool(True)  # Delta lobes only, so far
     length = mi.Float(0)  # Of the path
     density, per_area = mi.Float(0), mi.Bool(False)  # Of drawing its beginning
-    if dr.hint(o.glossy, mode="scalar"):
-        density, per_area = emitter_density(emitter, -ray.d, active)
+    if dr.hint(o.glossy is not None, mode="scalar"):
+        density, per_area = o.glossy.at(emitter, -ray.d, active)
 
     while dr.hint(active, label="light paths"):
         # --- Find the next vertex ---
@@ -234,7 +235,7 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
         if dr.hint(o.caustics == "only", mode="scalar"):
             deposit &= caustic
         seen_directly = mi.Float(0)
-        if dr.hint(o.glossy, mode="scalar"):
+        if dr.hint(o.glossy is not None, mode="scalar"):
             length += dr.select(active, si.t, 0)
             glossy &= active & same_side & delta_only & (depth >= 2)
             seen_directly = dr.select(glossy, seen_from(density, per_area, length), 0)
@@ -247,7 +248,7 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
         word = encode_normal(side) | (dr.minimum(depth, SEGMENTS_MAX) << 24)
         if dr.hint(o.caustics == "marked", mode="scalar"):
             word |= dr.select(caustic, mi.UInt32(CAUSTIC), mi.UInt32(0))
-        if dr.hint(o.glossy, mode="scalar"):
+        if dr.hint(o.glossy is not None, mode="scalar"):
             word |= dr.select(received, mi.UInt32(0), mi.UInt32(GLOSSY_ALONE))
         store(si.p, word, power, -ray.d, path, seen_directly, deposit)
 
@@ -259,7 +260,7 @@ def _trace_wavefront(scene, source, sampler, share, options, store, reject):
             bent = read_bent(bsdf, active)
             bs, bent_weight = bent_bounce(ctx, bsdf, si, bs, weight, sampler, bent)
             weight = dr.select(bent, bent_weight, weight)
-        if dr.hint(o.glossy, mode="scalar"):
+        if dr.hint(o.glossy is not None, mode="scalar"):
             delta_only &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         wo = si.to_world(bs.wo)
         wo_n, wo_s = dr.dot(wo, n), mi.Frame3f.cos_theta(bs.wo)

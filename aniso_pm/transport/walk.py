@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..lobe_path import GlossyVertex, follow, no_lobe
+from ..map.glossy_caustics import EmitterDensity
 from ..map.receivers import gathered_part, read_receiver, shining_pdf
 from ..map.spectra import channel_mean
 from . import layers
@@ -42,7 +43,8 @@ class WalkOptions:
     deep           the scene has surfaces to walk on (``needs.chains``).
     general        the scene has receivers that are not Lambertian (``needs.general``).
     roughness      smallest alpha that is gathered on.
-    glossy         caustics on glossy surfaces are photons' too (see ``glossy_caustics``).
+    glossy         density of drawing emitters, where glossy caustics are photons' too (see
+                   ``glossy_caustics``); else None.
     measure        keep the length of the path at gather points.
     thinning       which paths leave gather points; None: all do.
     light          split light by how it came (see ``layers``).
@@ -61,7 +63,7 @@ class WalkOptions:
     deep: bool
     general: bool
     roughness: float
-    glossy: bool = False
+    glossy: EmitterDensity | None = None
     measure: bool = False
     thinning: Thinning | None = None
     light: bool = False
@@ -130,7 +132,9 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
     path = first_lobe(o)
     distance = mi.Float(0)  # Length of the path
     trail = layers.begin(o.light, o.surface)  # What it keeps for layers, if anybody asks
-    chain = Chain.begin() if o.glossy else None  # Since the last vertex that was not a delta lobe
+    chain = (
+        Chain.begin() if o.glossy is not None else None
+    )  # Since the last vertex that was not a delta lobe
     apart = Apart.begin() if o.use == "survey" else None  # What the survey tells apart
     chosen, worth = mi.Bool(True), mi.Float(1)  # Does the path gather, and for how many others?
     if dr.hint(o.thinning is not None, mode="scalar"):
@@ -153,7 +157,7 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
         emission = mis * ds.emitter.eval(si, seen)
         if dr.hint(chain is not None, mode="scalar"):
             chain.length += dr.select(active & si.is_valid(), si.t, 0)
-            chance = chain.weight(ds, seen)
+            chance = chain.weight(o.glossy, ds, seen)
             if dr.hint(apart is not None, mode="scalar"):
                 apart.leave_to_maps(β_direct * emission * (1 - chance), seen)
             emission *= chance
@@ -221,7 +225,8 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
         ray = spawn_ray(si, si.to_world(bs.wo), reach)
         β, β_direct, scattered = _go_on(o, sampler, β * weight, g, scattered, active, apart)
         if dr.hint(chain is not None, mode="scalar"):
-            shines &= ~scattered & ~delta
+            shines &= ~scattered & ~delta & _on_one_side(si, bs.wo)
+            # Not bs.pdf, which mask and blend have of the BSDF inside that they chose.
             pdf = shining_pdf(bsdf, si, bs.wo, shines)
             chain.leave(shines, pdf, delta, active)
         η *= bs.eta
@@ -264,6 +269,15 @@ def _sample_light(scene, o, sampler, ctx, si, bsdf, β, chances, active):
         lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), lit)
     light *= β * dr.select(ds.delta, 1, _power_heuristic(ds.pdf, pdf))
     return ds, light, wo, f, lit
+
+
+def _on_one_side(si, wo):
+    """Does a photon that comes from there (local) count for what si.wi sees? (Not where shading and
+    geometric normal disagree about the side.)"""
+    n = dr.mulsign(mi.Vector3f(si.n), dr.dot(si.n, si.sh_frame.n))
+    cos_s = mi.Frame3f.cos_theta(wo)
+    reflects = mi.Frame3f.cos_theta(si.wi) * cos_s > 0
+    return reflects & (dr.dot(si.to_world(wo), n) * cos_s > 0)
 
 
 def _light_pdf(scene, direct, si, chances, ds, active):
