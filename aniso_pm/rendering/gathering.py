@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from ..map import density, walls
@@ -21,6 +22,11 @@ from ..map.receivers import read_cover
 from ..transport.gathered_layers import split
 from ..transport.uses import Use
 from .footprint import TRIED, Footprint
+
+
+# Kernels of glossy caustics, as a share of those of their pixel: most of what these are right for is
+# smoother, as it is seen over the metal (docs/performance.md).
+_GLOSSY = 0.7
 
 
 @dataclass(frozen=True)
@@ -104,7 +110,8 @@ def bandwidth(points: GatherPoints, radius, footprint: Footprint | None):
     """Of each gather point, world units. radius: of the pass."""
     if footprint is None:
         return radius
-    return radius * footprint.share(points.distance, points.lane)
+    radius = radius * footprint.share(points.distance, points.lane)
+    return radius if points.glossy is None else radius * dr.select(points.glossy, _GLOSSY, 1)
 
 
 def thickness(points: GatherPoints, radius, footprint: Footprint | None):
