@@ -23,9 +23,8 @@ from ..transport.gathered_layers import split
 from ..transport.uses import Use
 from .footprint import TRIED, Footprint
 
-
-# Kernels of glossy caustics, as a share of those of their pixel: most of what these are right for is
-# smoother, as it is seen over the metal (docs/performance.md).
+# Kernels of glossy caustics, as a share of those of their pixel, which are right for what the metal
+# mirrors and are too wide here (docs/performance.md).
 _GLOSSY = 0.7
 
 
