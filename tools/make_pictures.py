@@ -135,8 +135,8 @@ def as_installed(seconds=5.0):
     reference = references.read(SCENES / "references" / f"{name}.exr")
     for seed in (1, 2):
         began = time.perf_counter()
-        render(scene, {"type": "path"}, 64, seed)
-    samples = int(64 * seconds / (time.perf_counter() - began))
+        render(scene, {"type": "path"}, 512, seed)
+    samples = int(512 * seconds / (time.perf_counter() - began))
     ours = {"type": "aniso_pm", "time": seconds}
     render(scene, ours, 0, 1)
     columns = []
