@@ -244,32 +244,32 @@ def photons_inside(
 
 @dataclass(frozen=True)
 class Surface:
-    """The gathered parts of the BSDFs at gather points, or where ``glossy`` all of them, for glossy
-    caustics (None: nowhere); ``roughness`` as in ``receivers``."""
+    """The gathered parts of the BSDFs at gather points, or with ``glossy`` all of them, for glossy
+    caustics; ``roughness`` as in ``receivers``."""
 
     bsdf: Any
     si: Any
     roughness: float
-    glossy: Any = None
+    glossy: bool
 
     @staticmethod
-    def at(scene, points: GatherPoints, roughness: float, wavelengths) -> Surface:
+    def at(scene, points: GatherPoints, roughness: float, glossy: bool, wavelengths) -> Surface:
         """Found again by the rays that found it first."""
         ray = mi.Ray3f(points.origin, points.d)
         if wavelengths is not None:
             ray.wavelengths = wavelengths
         si = scene.ray_intersect(ray)
-        return Surface(si.bsdf(ray), si, roughness, points.glossy)
+        return Surface(si.bsdf(ray), si, roughness, glossy)
 
     def brdf(self, photons: PhotonMap, slot, active):
         """BRDF value (1/sr) towards the viewer for the light of the photon in a slot."""
         wo = self.si.to_local(photon_direction(photons, slot, active))
-        gathers = active if self.glossy is None else active & ~self.glossy
-        value = gathered_part(self.bsdf, self.si, wo, self.roughness, gathers)
-        if self.glossy is not None:
-            q = dr.gather(mi.Float, photons.emitter_density, slot, active & self.glossy)
-            shining, p = shining_part(self.bsdf, self.si, wo, q > 0)
-            value += shining * by_photons(p, q)
+        if self.glossy:
+            q = dr.gather(mi.Float, photons.emitter_density, slot, active)
+            value, p = shining_part(self.bsdf, self.si, wo, q > 0)
+            value *= by_photons(p, q)
+        else:
+            value = gathered_part(self.bsdf, self.si, wo, self.roughness, active)
         # Bump maps keep their value where this cosine vanishes: no more than a hundredfold.
         return value / dr.maximum(dr.abs(mi.Frame3f.cos_theta(wo)), 0.01)
 

@@ -128,9 +128,9 @@ def may_shine(bsdf, threshold: float) -> bool:
     if not _reflects_smoothly(bsdf):
         return False
     smallest = _smallest_roughness(bsdf)
-    if smallest is None or _roughness_varies(bsdf):
-        return True
-    return _SHINES_FROM <= _uniform(smallest) < threshold
+    if smallest is not None and not _roughness_varies(bsdf):
+        return _SHINES_FROM <= _uniform(smallest) < threshold
+    return True
 
 
 def shining_part(bsdf, si, wo, active):

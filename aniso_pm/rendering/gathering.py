@@ -38,6 +38,7 @@ class GatherOptions:
     receiving   addresses of the BSDFs that gather; None where all do and none lets light pass.
     roughness   smallest alpha that is gathered on; None where all points are on Lambertian
                 receivers.
+    glossy      gather points are there for glossy caustics.
     tolerance   of sums, see ``density.estimate``.
     use         of the map, and ``unseen``, is there light that only photons find: for layers.
     light       split it by how it came; radius: keep bandwidths.
@@ -48,6 +49,7 @@ class GatherOptions:
     compensate: bool
     receiving: tuple[int, ...] | None
     roughness: float | None
+    glossy: bool
     tolerance: float
     use: Use
     unseen: bool
@@ -73,7 +75,7 @@ def gather(
     scores,
     options: GatherOptions,
 ) -> density.Gathered:
-    """Reflected radiance at gather points, all on Lambertian receivers or none, not yet evaluated.
+    """Reflected radiance at gather points, all of one kind, not yet evaluated.
 
     map_         PhotonMap, its numbers as arrays (``PhotonMap.numbered``).
     radius       bandwidth of the pass, world units; seed: of random numbers. Both Dr.Jit arrays.
@@ -83,7 +85,7 @@ def gather(
     o = options
     surface = None
     if o.roughness is not None:
-        surface = density.Surface.at(scene, points, o.roughness, wavelengths)
+        surface = density.Surface.at(scene, points, o.roughness, o.glossy, wavelengths)
     thick = thickness(points, radius, footprint)
     radius = bandwidth(points, radius, footprint)
     kernel, follows, degenerate = density.kernels(points, radius, o.kernel)

@@ -240,7 +240,8 @@ class Prepared(Decisions):
             kinds.append((~points.lambertian & ~glossy, {"roughness": roughness}))
         if points.glossy is not None:
             shining = tuple(sorted(self.needs.shining))
-            kinds.append((glossy, {"roughness": roughness, "receiving": shining}))
+            changes = {"roughness": roughness, "glossy": True, "receiving": shining}
+            kinds.append((glossy, changes))
         parts = []
         for some, changes in kinds:
             index = dr.compress(some)
@@ -258,6 +259,7 @@ class Prepared(Decisions):
             compensate=s.edge_compensation,
             receiving=tuple(sorted(self.needs.receiving)) if self.deep else None,
             roughness=None,
+            glossy=False,
             tolerance=s.gather_tolerance,
             use=self.use,
             unseen=bool(self.needs.unseen),
