@@ -171,6 +171,26 @@ def test_near_lamps_are_asked_most():
     assert max(p) > 0.6
 
 
+def test_an_environment_is_asked_for_what_other_samples_hardly_find(variants_all):
+    """A constant one has the density 1/(4π), a diffuse surface up to 1/π."""
+    sky = scene_of({"sky": {"type": "constant", "radiance": 0.2}}).emitters()[0]
+    assert direct_light._left_to_us(sky) == pytest.approx(1 / 17, rel=1e-4)
+    pixels = np.full((32, 64, 3), 0.1, np.float32)
+    pixels[8, 20] = 2e4
+    lamp = {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": mi.ScalarTransform4f()}
+    assert direct_light._left_to_us(scene_of({"sun": lamp}).emitters()[0]) > 0.8
+    sun = scene_of({"sun": {"type": "directional", "direction": [0, 0, -1]}}).emitters()[0]
+    assert direct_light._left_to_us(sun) == 1
+    # Beside a lamp that gives as much: a constant sky is asked for a seventeenth of its light.
+    lamps = {k: emitters()[k] for k in ("sky", "flat")}
+    direct = prepared(scene_of(lamps))
+    si = dr.zeros(mi.SurfaceInteraction3f, 1)
+    si.p, n = mi.Point3f(0.3, 0.2, -1), mi.Vector3f(0, 0, 1)
+    lamp, sky = (float(g.irradiance(si.p, n, mi.Bool(False))[0]) for g in direct.groups)
+    # Their irradiance is E = L A/d² and π L.
+    assert sky / lamp == pytest.approx(np.pi * 0.2 / 17 / (20 * 0.04 / 1.9**2), rel=0.02)
+
+
 def test_a_strong_lamp_among_many_is_a_group_of_its_own():
     lamps = {f"lamp_{k}": square(0.05 * k - 0.8, 0, 0.9, 0.02, 1.0) for k in range(40)}
     lamps["lamp_17"] = square(0.05 * 17 - 0.8, 0, 0.9, 0.02, 500.0)

@@ -153,7 +153,7 @@ def test_work_that_a_plan_counts_is_what_passes_do(variant_llvm_rgb, monkeypatch
     assert found.light_work == pytest.approx(light, rel=0.1)
 
 
-def _plan(light_paths=0, met=4000.0, aside=5.0, edge=2):
+def _plan(light_paths=0, met=4000.0, aside=5.0, edge=2, alpha=1.0, **more):
     """Of a picture whose left third has nearly all photons: so many that an eye path meets there,
     and ``aside``; light beside it is smooth. edge: of tiles, in pixels."""
     random = np.random.default_rng(2)
@@ -190,10 +190,8 @@ def _plan(light_paths=0, met=4000.0, aside=5.0, edge=2):
         filtered=1.0,
         total=1e6,
         whole=2 * pairs,
-        use="global",
-        weight=pairs,
-        v_own=0.2 * pairs,
-        found=found,
+        alpha=alpha,
+        **{"use": "global", "weight": pairs, "v_own": 0.2 * pairs, "found": found} | more,
     )
 
 
@@ -204,6 +202,26 @@ def test_no_other_number_of_light_paths_promises_less(edge):
     for factor in (0.25, 0.5, 2, 4):
         other = _plan(light_paths=factor * best.light_paths, edge=edge)
         assert best.error < 1.1 * other.error, factor
+
+
+def test_kernels_that_shrink_promise_more_noise():
+    """α = 1: they stay. Else photons' noise goes by the mean of (r_0/r_i)², here from the product
+    that defines r_i."""
+    alpha = 0.5
+    i = np.arange(1, plan.PASSES)
+    area = np.concatenate([[1], np.cumprod((i + alpha) / (i + 1))])
+    stays, shrinks = (_plan(light_paths=2000, alpha=a) for a in (1.0, alpha))
+    assert 1 < shrinks.error / stays.error < (1 / area).mean()
+    # With next to no photons nearly all of the error is their noise.
+    few = [_plan(light_paths=2, alpha=a).error for a in (1.0, alpha)]
+    assert few[1] / few[0] == pytest.approx((1 / area).mean(), rel=0.05)
+
+
+def test_passes_without_a_map_cost_next_to_nothing_besides():
+    none = _plan(use="none", found=None, edge=1)
+    per_sample = none.work / (32 * none.tiles.pixels)
+    assert per_sample == pytest.approx(2 + plan._PASS_WITHOUT / (32 * none.tiles.pixels))
+    assert plan._PASS_WITHOUT < 0.2 * plan._PASS
 
 
 def test_what_every_pass_costs_is_worth_light_paths_in_small_pictures(monkeypatch):

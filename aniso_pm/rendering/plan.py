@@ -32,7 +32,9 @@ is smooth and as √w in the mean around an edge; between them, as w^1.5,
     bias²(w) = ⟨D D'⟩ (w/4)³/(2^1.5 − 1)²,    so    w⁵ = 2 B₁/(3 M N) · 4³ (2^1.5 − 1)²/⟨D D'⟩
 
 makes bias² + B₁/(w² M N) smallest after M = 32 passes. Means are taken over tiles and their
-neighbours.
+neighbours. What is promised after M passes knows that kernels shrink from pass to pass: photons'
+noise is multiplied by the mean of (r_0/r_i)² over the passes, bias² by the square of the mean of
+(r_i/r_0)^1.5.
 """
 
 from __future__ import annotations
@@ -47,6 +49,7 @@ from ..transport import aim
 from ..transport.uses import Use
 from . import footprint
 from .allotment import FEW
+from .schedule import bandwidth
 from .tiles import SAMPLES, Tiles, smooth
 
 # Widths of kernels that are compared, and the range of those that are chosen, in pixels.
@@ -58,8 +61,8 @@ PASSES = 32
 LEAST_SHARE = 1 / 8
 # Work of a gather, each photon it meets, a light path, a photon it leaves; an eye path is about 1.
 _GATHER, _MET, LIGHT_PATH, LEFT = 2.0, 1 / 30, 0.6, 0.4
-# Work of a pass besides, however small (docs/performance.md).
-_PASS = 1.5e5
+# Work of a pass besides, however small (docs/performance.md), and of one that has no map.
+_PASS, _PASS_WITHOUT = 1.5e5, 2e4
 # Light paths, and what meets their photons, are at most so many times the work of all else.
 _TIMES = 10
 # Variance of an eye sample among a few hundred stratified ones, as a share of that among SAMPLES:
@@ -153,6 +156,7 @@ class Plan:
         filtered: float,
         total: float,
         whole,
+        alpha: float,
         use: Use,
         weight,
         v_own,
@@ -167,6 +171,7 @@ class Plan:
         filtered  variance of eye paths that the film leaves (``film.noise_share``).
         total   work after which ``error`` is that of the mean over all passes.
         whole   work of path tracing.
+        alpha   by which kernels shrink from pass to pass (``schedule.bandwidth``).
         use     of the map; weight: of each pair.
         v_own   of an eye path, without what it gathers; later: what it has more because it goes on
                 beyond the first gathered part.
@@ -177,7 +182,7 @@ class Plan:
         v_eye = STRATIFIED * float(v_own.mean()) + _LATER_STRATIFIED * float(np.mean(later))
         v_eye = filtered * max(v_eye, 0.0)
         if found is None:
-            pass_ = each * tiles.pixels * float(work.mean()) + _PASS
+            pass_ = each * tiles.pixels * float(work.mean()) + _PASS_WITHOUT
             error = v_eye / each * pass_ / total
             share = np.full(1, 1.0 if use == "none" else LEAST_SHARE)
             nothing = np.zeros(len(whole))
@@ -233,11 +238,14 @@ class Plan:
         gather = (point + photon * area * paths) * share
         pass_ = samples * (eye_work + float(gather.mean())) + paths * light + _PASS
         left = pass_ / total
-        error = (eye_noise / each + by_photons / paths) * left
-        blur = noise.change * (widths / NARROW) ** 3 if choose else np.zeros(len(whole))
+        # Kernels of later passes are smaller.
+        radii = np.array([bandwidth(1.0, alpha, k) for k in range(PASSES)])
+        noisier, sharper = float((radii**-2).mean()), float((radii**1.5).mean()) ** 2
+        error = (eye_noise / each + noisier * by_photons / paths) * left
+        blur = sharper * noise.change * (widths / NARROW) ** 3 if choose else np.zeros(len(whole))
         error += _bias2(float(blur.mean()))
         follow = np.clip(found.over_lobes.sum(1) / np.maximum(found.a.sum(1), 1e-30), 0, 1)
-        behind = max(0.0, float((follow * b_1 / widths**2).mean())) / paths * left
+        behind = noisier * max(0.0, float((follow * b_1 / widths**2).mean())) / paths * left
         behind += _bias2(float((follow * blur).mean()))
         return Plan(
             tiles=tiles,

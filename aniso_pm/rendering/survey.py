@@ -54,8 +54,9 @@ _ASKS = 1.5
 # Work of a pass that is not to be exceeded where passes may have any length (see ``Plan.of``): a
 # third of a second.
 _LONGEST = 1.5e6
-# The caustic map has to promise an error smaller than the global one by so much.
-_BETTER = 0.9
+# The caustic map has to promise an error smaller than the global one by so much, path tracing one
+# smaller than maps.
+_BETTER, _BETTER_ALONE = 0.75, 0.9
 # Path tracing has found the caustics if it has so much of their light, by as many hits, or if they
 # are less than such a share of the picture's light. With fewer than the last number of hits their
 # variance is taken to be larger than it looks.
@@ -143,7 +144,8 @@ def look(scene: Prepared, sensor, seed: int) -> Seen:
 
         return see
 
-    room = 3 * tiles.lanes if scene.use == "survey" else 0
+    # In closed rooms paths leave many: when there is no room, all of them are traced again.
+    room = 8 * tiles.lanes if scene.use == "survey" else 0
     L, _, points = scene.trace(sampler, ray, room, watch=watch)
     later = caustic = glossy = mi.Float(0)
     if isinstance(L, Parts):
@@ -188,6 +190,7 @@ def decide(
         filtered=noise_share(sensor.film()),
         total=total,
         whole=seen.work,
+        alpha=scene.settings.alpha,
     )
     reader = Reader(scene, sensor, radius, seed, tiles.lanes)
     pilot = _Pilot(scene, sensor, seed, seen, maps, reader, plan_of).with_or_without_glossy()
@@ -287,7 +290,7 @@ class _Pilot:
                 of_caustics = within(all_, all_, weight) - within(light, light, weight)
                 plan = plan_of(use="none", later=later + doubt * of_caustics)
                 errors["none"] = plan.error
-                if plan.error < best.error:
+                if plan.error < _BETTER_ALONE * best.error:
                     best, read = plan, (None, None)
         return self._survey(best, errors, *read)
 

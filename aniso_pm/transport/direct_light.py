@@ -8,10 +8,12 @@ s_k being the ``sampling_weight`` of its emitters together, and w_k its irradian
 between: Φ/π cos θ cos θ'/d² of flat lamps of power Φ that look the same way, θ and θ' the angles at
 x and at the lamp, Φ/Ω cos θ/d² of what shines into a solid angle Ω. The angles are the best that a
 sphere around the group allows, d is never less than its radius, and light from far away is as
-bright everywhere [after the importance of Conty Estévez and Kulla 2018, without their tree]. A
-group is a single emitter as long as there are few, or as it is strong; neighbours in a group have
-the same chance. What stands between x and a lamp is not known: F keeps all of them in play.
-Emitters of weight 0 are never asked, as in ``path``.
+bright everywhere. Of an environment only that part counts which multiple importance sampling leaves
+to this: the rest is better found by the directions in which paths go on [after the importance of
+Conty Estévez and Kulla 2018, without their tree]. A group is a single emitter as long as there are
+few, or as it is strong; neighbours in a group have the same chance. What stands between x and a
+lamp is not known: F keeps all of them in play. Emitters of weight 0 are never asked, as in
+``path``.
 """
 
 from __future__ import annotations
@@ -206,6 +208,7 @@ def _group(emitters, first: int, weight: float, power: float, extent: float) -> 
         power *= extent**2 / (np.pi if cosine is None else 2 * np.pi * (1 - cosine))
     else:
         power /= np.pi * (4 if axis is None else 1)
+        power *= float(np.mean([_left_to_us(e) for e in emitters]))
     lobe = None if axis is None else mi.Vector3f(*axis.tolist())
     dr.make_opaque(centre, lobe)
     return Group(
@@ -218,6 +221,18 @@ def _group(emitters, first: int, weight: float, power: float, extent: float) -> 
         lobe,
         None if cosine is None or axis is None else number(mi.Float, cosine),
     )
+
+
+def _left_to_us(emitter) -> float:
+    """Part of the light of a far emitter that counts here: mean weight of the power heuristic, in
+    proportion to the light, at a diffuse surface, whose own density is 1/π at the most."""
+    if not emitter.is_environment():
+        return 1.0
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 1024)
+    here = dr.zeros(mi.SurfaceInteraction3f, 1024)
+    density = emitter.sample_direction(here, sampler.next_2d())[0].pdf.numpy().astype(np.float64)
+    return float(np.mean(density**2 / (density**2 + np.pi**-2)))
 
 
 def _lobe(emitters) -> tuple[np.ndarray | None, float | None]:
