@@ -23,6 +23,29 @@ def test_a_scene_without_emitters_is_black(rgb):
     assert array(mi.render(mi.load_dict(definition), integrator=integrator(), spp=4)).max() == 0
 
 
+@pytest.mark.parametrize("map_", ["auto", "global", "caustic"])
+def test_a_black_environment_map_takes_no_light_away(rgb, map_):
+    """Its density is 0/0."""
+    to_world = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(0.2)
+    emitter = {"type": "area", "radiance": 10.0}
+    look = mi.ScalarTransform4f().look_at([0, -3, 2], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 16, "height": 16}
+    definition = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "to_world": look, "film": film},
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(np.zeros((8, 16, 3), np.float32))},
+        "floor": {"type": "rectangle"},
+        "lamp": {"type": "rectangle", "to_world": to_world, "emitter": emitter},
+        "ball": {"type": "sphere", "radius": 0.3},
+    }
+    scene = mi.load_dict(definition)
+    plugin = integrator(initial_radius=0.0, map=map_)
+    image = array(mi.render(scene, integrator=plugin, spp=1024))
+    path = array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=1024))
+    np.testing.assert_allclose(image.mean(), path.mean(), rtol=0.02)
+    assert plugin.statistics["eye_samples_rejected"] == 0
+
+
 def test_a_scene_without_receivers_is_path_traced(rgb):
     definition = {
         "type": "scene",

@@ -324,8 +324,10 @@ def _go_on(o, sampler, β_both, g, scattered, active, apart):
 
 
 def _power_heuristic(a, b):
-    """Veach's weight a²/(a² + b²) of a sample drawn with density a."""
-    return dr.select(dr.isfinite(a), dr.rcp(1 + dr.square(b / a)), 1)
+    """Veach's weight a²/(a² + b²) of a sample drawn with density a. 0 where one is not a number, as
+    that of a black environment map is."""
+    weight = dr.select(dr.isfinite(a), dr.rcp(1 + dr.square(b / a)), 1)
+    return dr.select(dr.isnan(weight), 0, weight)
 
 
 @dr.syntax
