@@ -73,8 +73,8 @@ class AnisoPhotonMapper:
          ``caustic``: the map holds only light that reached a receiver over glass, mirrors and
          glossy surfaces; the rest is path traced, and scenes without caustics have no map.
          ``auto``: a pilot finds out which of the two, or path tracing without any photon, has
-         the least error for the time in this scene, ``caustic`` only if that is a tenth less than
-         with ``global``; path tracing only if the pilot's eye paths
+         the least error for the time in this scene, ``caustic`` only if that is a quarter less than
+         with ``global``; path tracing only if that is a tenth less, if the pilot's eye paths
          have met most of the light of the caustics, or there is next to none, no light is a point
          or a direction, and neither ``photon_count`` nor ``initial_radius`` is given.
          Scenes without surfaces that light is traced over (glass, mirrors, smooth or coated metal)
