@@ -260,6 +260,17 @@ def test_a_camera_that_sees_glass_and_metal_alone(variant_llvm_rgb, use):
     assert not pilot.settle(prepared, scene.sensors()[0], 0, 16).rare
 
 
+def test_a_black_environment_map_has_no_density(variant_llvm_rgb):
+    """Mitsuba says 0/0, which would make every sample non-finite that leaves the scene."""
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.zeros((8, 16, 3), np.float32))}
+    scene = mi.load_dict(plate(lamp(0.05), size=16) | {"sky": sky})
+    prepared = prepare(scene, Settings(), False)
+    assert prepared.rare and prepared.drawn.surrounded
+    integrator = mi.load_dict({"type": "aniso_pm"})
+    array(mi.render(scene, integrator=integrator, spp=64))
+    assert integrator.statistics["eye_samples_rejected"] == 0
+
+
 def test_narrow_lobes_are_left_to_paths(variant_llvm_rgb):
     assert rare(plate(POINT, METAL | {"alpha_u": 0.012, "alpha_v": 0.012}))
     assert not rare(plate(POINT, METAL | {"alpha_u": 0.008, "alpha_v": 0.012}))

@@ -188,10 +188,10 @@ def _plan(light_paths=0, met=4000.0, aside=5.0, edge=2, alpha=1.0, **more):
         choose=True,
         light_paths=light_paths,
         filtered=1.0,
-        total=1e6,
         whole=2 * pairs,
         alpha=alpha,
-        **{"use": "global", "weight": pairs, "v_own": 0.2 * pairs, "found": found} | more,
+        **{"use": "global", "weight": pairs, "v_own": 0.2 * pairs, "found": found, "total": 1e6}
+        | more,
     )
 
 
@@ -204,9 +204,9 @@ def test_no_other_number_of_light_paths_promises_less(edge):
         assert best.error < 1.1 * other.error, factor
 
 
-def test_kernels_that_shrink_promise_more_noise():
+def test_kernels_that_shrink_promise_more_noise_and_less_bias():
     """α = 1: they stay. Else photons' noise goes by the mean of (r_0/r_i)², here from the product
-    that defines r_i."""
+    that defines r_i, and bias by that of (r_i/r_0)^1.5."""
     alpha = 0.5
     i = np.arange(1, plan.PASSES)
     area = np.concatenate([[1], np.cumprod((i + alpha) / (i + 1))])
@@ -215,6 +215,9 @@ def test_kernels_that_shrink_promise_more_noise():
     # With next to no photons nearly all of the error is their noise.
     few = [_plan(light_paths=2, alpha=a).error for a in (1.0, alpha)]
     assert few[1] / few[0] == pytest.approx((1 / area).mean(), rel=0.05)
+    # After endless work all of it is bias².
+    bias2 = [_plan(light_paths=2000, alpha=a, total=1e30).error for a in (1.0, alpha)]
+    assert bias2[1] / bias2[0] == pytest.approx((area**0.75).mean() ** 2)
 
 
 def test_passes_without_a_map_cost_next_to_nothing_besides():
@@ -222,6 +225,39 @@ def test_passes_without_a_map_cost_next_to_nothing_besides():
     per_sample = none.work / (32 * none.tiles.pixels)
     assert per_sample == pytest.approx(2 + plan._PASS_WITHOUT / (32 * none.tiles.pixels))
     assert plan._PASS_WITHOUT < 0.2 * plan._PASS
+
+
+@pytest.mark.parametrize(
+    ("caustic", "alone", "use"),
+    [(0.6, 0.9, "caustic"), (0.3, 0.9, "global"), (0.3, 2, "none"), (0.6, 5, "none")],
+)
+def test_a_use_is_chosen_if_it_is_better_by_enough(
+    variant_llvm_rgb, monkeypatch, caustic, alone, use
+):
+    """Here the caustic map promises 0.44 of the global one's error, path tracing 1.5 times that."""
+    monkeypatch.setattr(survey, "_BETTER", caustic)
+    monkeypatch.setattr(survey, "_BETTER_ALONE", alone)
+    found, _ = settled(room_with_ball(size=24))
+    assert found.use == use
+    best = found.errors["caustic" if caustic == 0.6 else "global"]
+    assert (found.errors["none"] < alone * best) == (use == "none")
+    assert (found.errors["caustic"] < caustic * found.errors["global"]) == (caustic == 0.6)
+
+
+def test_pairs_of_a_closed_room_are_traced_once(variant_llvm_rgb, monkeypatch):
+    """Their paths leave more than three gather points each."""
+    traced = []
+
+    def eye_paths(*wavefront, trace=eye.eye_paths, **watch):
+        traced.append(wavefront)
+        return trace(*wavefront, **watch)
+
+    monkeypatch.setattr(eye, "eye_paths", eye_paths)
+    world = mi.load_dict(room_with_ball(size=24))
+    scene = replace(prepare(world, Settings(), False), chosen="survey")
+    seen = survey.look(scene, world.sensors()[0], 0)
+    assert dr.width(seen.points.lane) > 3 * seen.tiles.lanes
+    assert len(traced) == 1
 
 
 def test_what_every_pass_costs_is_worth_light_paths_in_small_pictures(monkeypatch):

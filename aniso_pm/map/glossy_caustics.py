@@ -63,6 +63,8 @@ class EmitterDensity:
             ds = dr.zeros(mi.DirectionSample3f)
             ds.d = direction
             of_direction = emitter.pdf_direction(dr.zeros(mi.Interaction3f), ds, far)
+            # A black environment map says 0/0.
+            of_direction = dr.select(dr.isnan(of_direction), 0, of_direction)
             density = dr.select(far, dr.minimum(of_direction, _DELTA), density)
             per_area &= ~far
         return density, per_area

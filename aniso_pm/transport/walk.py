@@ -283,8 +283,11 @@ def _on_one_side(si, wo):
 def _light_pdf(scene, direct, si, chances, ds, active):
     """Density with which ``_sample_light`` would have drawn what was met."""
     if direct is None:
-        return scene.pdf_emitter_direction(si, ds, active)
-    return direct.pdf(si, chances, ds, active)
+        density = scene.pdf_emitter_direction(si, ds, active)
+    else:
+        density = direct.pdf(si, chances, ds, active)
+    # A black environment map says 0/0.
+    return dr.select(dr.isnan(density), 0, density)
 
 
 def _gathered_share(o, ctx, bsdf, si, bs, is_receiver, lambertian, delta):
@@ -324,10 +327,8 @@ def _go_on(o, sampler, β_both, g, scattered, active, apart):
 
 
 def _power_heuristic(a, b):
-    """Veach's weight a²/(a² + b²) of a sample drawn with density a. 0 where one is not a number, as
-    that of a black environment map is."""
-    weight = dr.select(dr.isfinite(a), dr.rcp(1 + dr.square(b / a)), 1)
-    return dr.select(dr.isnan(weight), 0, weight)
+    """Veach's weight a²/(a² + b²) of a sample drawn with density a."""
+    return dr.select(dr.isfinite(a), dr.rcp(1 + dr.square(b / a)), 1)
 
 
 @dr.syntax
