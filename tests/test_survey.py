@@ -1,6 +1,7 @@
 """What the survey finds, against what renderings of known noise show."""
 
 import gc
+import math
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
@@ -467,3 +468,68 @@ def test_a_film_of_one_pixel_has_nothing_to_tell_apart(variant_llvm_rgb):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert tiles.counts(np.ones(1), np.ones(1), 16) is None
+
+
+def test_every_fourth_tile_is_one_of_twice_the_edge(variant_llvm_rgb):
+    film = {"type": "hdrfilm", "width": 101, "height": 75, "rfilter": {"type": "box"}}
+    sensor = mi.load_dict({"type": "perspective", "film": film})
+    all_ = Tiles.of(sensor, 2000)
+    few, pairs = all_.every_fourth()
+    assert few == replace(all_, edge=2 * all_.edge)
+    assert few.pairs == len(pairs) == few.across * few.down
+    of_row, of_column = np.divmod(np.arange(all_.pairs), all_.across)
+    # What these have is that of the tile in whose corner they are.
+    np.testing.assert_array_equal(few.refined(of_row[pairs], all_), of_row // 2 * 2)
+    np.testing.assert_array_equal(few.refined(of_column[pairs], all_), of_column // 2 * 2)
+    assert Tiles.of(sensor, 600).every_fourth() is None
+
+
+def test_a_part_of_the_pairs_reads_what_all_would_read_there(variant_llvm_rgb, monkeypatch):
+    scene = mi.load_dict(room_with_ball(size=64))
+    exact = Settings(edge_compensation=False)  # probes of edges are random
+    prepared = replace(prepare(scene, exact, False), chosen="survey")
+    sensor = scene.sensors()[0]
+    seen = survey.look(prepared, sensor, 0)
+    photons = prepared.with_(photon_count=1000)
+    maps = [photons.photon_map(0, k, 0, None, remember=True) for k in (0, 1)]
+    everyone = reading.Reader.of_all(prepared, sensor, None, 0, seen.tiles)
+    few = everyone.of_every_fourth(seen.points)
+    assert everyone.pairs.size == 4 * few.pairs.size
+    monkeypatch.setattr(reading, "_MET_BY_ALL", math.inf)
+    all_, some = (
+        reader.found(maps, seen.points, lambda gathered: np.ones(len(gathered)))
+        for reader in (everyone, few)
+    )
+    assert some.light.max() > 0
+    for name in ("a", "b", "wide_a", "wide_b", "met", "points"):
+        expected = getattr(all_, name)[few.pairs]
+        np.testing.assert_allclose(getattr(some, name), expected, rtol=1e-4, atol=1e-6)
+    corners = few.spread(some.wide_a)[few.pairs]
+    np.testing.assert_allclose(corners[:, 0], some.wide_a.mean(1))
+    monkeypatch.setattr(reading, "_TELL", 1e6)
+    assert everyone.of_every_fourth(seen.points) is None
+
+
+def test_uses_are_compared_by_a_part_of_the_pairs(variant_llvm_rgb, monkeypatch):
+    """All of them read a map only for the use that is chosen: the plan is what it would be."""
+    readers = []
+    found = reading.Reader.found
+
+    def watched(reader, *given):
+        readers.append(reader.pairs.size)
+        return found(reader, *given)
+
+    monkeypatch.setattr(reading.Reader, "found", watched)
+    monkeypatch.setattr(survey, "_CLOSE", 0)
+    by_few, _ = settled(room_with_ball(size=64))
+    assert readers == [1024, 1024] + [4096] * (by_few.use != "none")
+    monkeypatch.setattr(reading.Reader, "of_every_fourth", lambda *_: None)
+    by_all, _ = settled(room_with_ball(size=64))
+    assert by_few.use == by_all.use and by_few.count == by_all.count
+    np.testing.assert_array_equal(by_few.share, by_all.share)
+    np.testing.assert_allclose(by_few.widths, by_all.widths, rtol=1e-4)
+
+    def against_global(errors):
+        return errors["caustic"] / errors["global"]
+
+    assert against_global(by_few.errors) == pytest.approx(against_global(by_all.errors), rel=0.15)

@@ -23,7 +23,7 @@ from . import footprint
 from .film import wavelengths
 from .plan import LEFT, LIGHT_PATH, NARROW, WIDE, Found
 from .prepared import Prepared
-from .tiles import SAMPLES
+from .tiles import SAMPLES, Tiles
 
 # Work of gathers where receivers are not Lambertian, each photon of which asks the BSDF, so many
 # times that where they are.
@@ -33,26 +33,52 @@ _ASKS = 2.0
 _MET_BY_ALL, _ASKED = 2e6, 16
 # Light paths of a map that are left at least.
 _FEWEST = 2000
+# Gather points that tell something, of a part of the pairs.
+_TELL = 500
 
 
 @dataclass(frozen=True)
 class Reader:
-    """scene, sensor, radius, seed: as for ``survey.decide``; lanes: eye paths of the pairs."""
+    """scene, sensor, radius, seed: as for ``survey.decide``.
+
+    all_tiles  of all pairs of eye paths; tiles: of those that read, pairs: their indices. Gather
+               points are given of all pairs; what is read are values of those that read.
+    """
 
     scene: Prepared
     sensor: Any
     radius: Any
     seed: int
-    lanes: int
+    all_tiles: Tiles
+    tiles: Tiles
+    pairs: np.ndarray
+
+    @staticmethod
+    def of_all(scene: Prepared, sensor, radius, seed: int, tiles: Tiles) -> Reader:
+        return Reader(scene, sensor, radius, seed, tiles, tiles, np.arange(tiles.pairs))
+
+    def of_every_fourth(self, points) -> Reader | None:
+        """None where these tell nothing: then all read."""
+        found = self.all_tiles.every_fourth()
+        few = found and replace(self, tiles=found[0], pairs=found[1])
+        return few if few and dr.width(few._own(points).lane) >= _TELL else None
+
+    def spread(self, light) -> np.ndarray:
+        """Of pairs that read, as of all."""
+        if self.tiles is self.all_tiles:
+            return light
+        return self.tiles.refined(light.mean(1), self.all_tiles)[:, None]
 
     def light(self, map_: PhotonMap, points) -> np.ndarray:
         """Of a map, through wide kernels, of each pair."""
+        points = self._own(points)
         wide = self._kernels(WIDE)
         (map_,) = self._few_enough([map_], points, wide, 1.0)
         return self._gathered(wide, points, map_, self._scores(map_))[0]
 
     def found(self, maps, points, weigh) -> Found:
         """weigh: pairs of gathered light → weight of each pair."""
+        points = self._own(points)
         kernels = [self._kernels(width) for width in (NARROW, WIDE)]
         wider = 1.0 if self.radius else (WIDE / NARROW) ** 2
         maps = self._few_enough(maps, points, kernels[0], wider)
@@ -79,6 +105,26 @@ class Reader:
             met_by_any=sum(int(np.count_nonzero(column)) for column in columns),
         )
 
+    @property
+    def lanes(self) -> int:
+        return self.tiles.lanes
+
+    @property
+    def _share(self) -> float:
+        """Of the pairs, that read."""
+        return self.tiles.pairs / self.all_tiles.pairs
+
+    def _own(self, points):
+        """Those of the pairs that read, whose eye paths are counted anew."""
+        if self.tiles is self.all_tiles:
+            return points
+        each, others = 2 * SAMPLES, len(self.pairs)
+        place = np.full(self.all_tiles.pairs, others, np.uint32)
+        place[self.pairs] = np.arange(others)
+        pair = dr.gather(mi.UInt32, arrays.own(mi.UInt32, place), points.lane // each)
+        points = replace(points, lane=each * pair + points.lane % each)
+        return take(points, dr.compress(pair < others))
+
     @cached_property
     def _colours(self):
         return wavelengths(self.sensor, 0.5) if mi.is_spectral else None
@@ -102,13 +148,15 @@ class Reader:
     def _few_enough(self, maps, points, kernels, wider: float):
         """Maps with as many photons as there may be for kernels whose area is ``wider`` times that
         of the given ones."""
-        asked = take(points, dr.arange(mi.UInt32, -(-dr.width(points.lane) // _ASKED)) * _ASKED)
+        every = max(1, round(_ASKED * self._share))
+        asked = take(points, dr.arange(mi.UInt32, -(-dr.width(points.lane) // every)) * every)
         dr.eval(asked)  # so that the kernel is that of all points
         few = self._gathered(kernels, asked, maps[0], self._scores(maps[0]))[2]
-        most = float(few.mean()) * _ASKED * self.lanes * wider
-        if most <= _MET_BY_ALL:
+        most = float(few.mean()) * every * self.lanes * wider
+        allowed = _MET_BY_ALL * self._share
+        if most <= allowed:
             return maps
-        left = int(maps[0].emitted * _MET_BY_ALL / most)
+        left = int(maps[0].emitted * allowed / most)
         return [thinned(map_, max(left, _FEWEST)) for map_ in maps]
 
     def _scores(self, map_: PhotonMap, weight=None):

@@ -14,7 +14,8 @@ finds some caustics by rare hits that a pilot may miss, so that their variance s
 chosen only where it has found the caustics that the map holds, their variance taken to be the
 larger the fewer hits they were, or where these are next to none. Nor is a map chosen that misses
 what eye paths have met, where they may do without. What the other uses leave to eye
-paths bounds their errors from below: where path tracing comes close to that, no map is read.
+paths bounds their errors from below: where path tracing comes close to that, no map is read. Else
+every fourth pair reads maps to compare uses, and all of them that of the use that is chosen.
 """
 
 from __future__ import annotations
@@ -70,6 +71,7 @@ _CLOSE = 1.5
 # Chance with which eye paths meet lamps in glossy caustics, about. Photons for these are worth
 # their time where such a part of the variance goes: they make passes dearer by a tenth or two.
 _CHANCE, _LITTLE = 0.1, 0.03
+_ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -192,11 +194,28 @@ def decide(
         whole=seen.work,
         alpha=scene.settings.alpha,
     )
-    reader = Reader(scene, sensor, radius, seed, tiles.lanes)
+    reader = Reader.of_all(scene, sensor, radius, seed, tiles)
     pilot = _Pilot(scene, sensor, seed, seen, maps, reader, plan_of).with_or_without_glossy()
     if pilot.seen.points is None or not min(map_.stored for map_ in maps):
         return pilot.nothing_to_read()
     return pilot.best_use() if scene.use == "survey" else pilot.given_use()
+
+
+@dataclass(frozen=True)
+class _Use:
+    """A use of the map, and how pairs read it.
+
+    maps, points  two maps, and where these are read.
+    weigh  gathered light → weight, of each pair.
+    work, later  of all pairs, as for ``Plan._of``.
+    """
+
+    use: Use
+    maps: Any
+    points: Any
+    weigh: Callable[..., Any]
+    work: Any = None
+    later: Any = 0.0
 
 
 @dataclass(frozen=True)
@@ -246,53 +265,61 @@ class _Pilot:
         light = seen.own + seen.later + (0 if use == "caustic" else seen.caustic)
         weight = seen.tiles.weight(light)
         plan = self.plan_of(use=use, weight=weight, v_own=within(light, light, weight))
-        return self._survey(plan, {}, None, None)
+        return self._survey(plan, {})
 
     def given_use(self) -> Survey:
         """The use of the map is not open."""
-        found, plan_of, _ = self._of_reading(self.seen.points)
-        plan = plan_of(use=self.scene.use, found=found)
-        return self._survey(plan, {}, self.maps[0], self.seen.points)
+        read = _Use(self.scene.use, self.maps, self.seen.points, self._weight)
+        return self._survey(self._plan(self.reader, read)[0], {}, read)
 
     def best_use(self) -> Survey:
-        """That which promises the least error."""
-        seen = self.seen
+        """That which promises the least error by what every fourth pair reads, which tells uses
+        apart as well as all do; these read for that use alone."""
         if self.scene.photons_are_dispensable and (plan := self._without_reading()):
-            return self._survey(plan, {"none": plan.error}, None, None)
-        first = take(seen.points, dr.compress(~seen.points.later))
-        found, plan_of, weight = self._of_reading(first)
+            return self._survey(plan, {"none": plan.error})
+        few = self.reader.of_every_fourth(self.seen.points)
+        plan, errors, read = self._compared(few or self.reader)
+        if few and read:
+            plan = self._plan(self.reader, read)[0]
+        return self._survey(plan, errors, read)
+
+    def _compared(self, reader: Reader) -> tuple[Plan, dict[str, float | None], _Use | None]:
+        """(best plan, the errors that uses promise, what is to be read for the best)."""
+        seen = self.seen
         asks = dearer(seen.points, _ASKS)
-        best = plan_of(use="global", found=found, work=asks * seen.early)
-        errors: dict[str, float | None] = {"global": best.error}
-        read: tuple[Any, Any] = self.maps[0], first
-        if self._misses(seen.later + seen.caustic, found, weight):
+        errors: dict[str, float | None] = {}
+        first = take(seen.points, dr.compress(~seen.points.later))
+        at_first = _Use("global", self.maps, first, self._weight, asks * seen.early)
+        best, found, weight = self._plan(reader, at_first)
+        read: _Use | None = at_first
+        errors["global"] = best.error
+        if self._misses(seen.later + seen.caustic, found, weight, reader.pairs):
             errors["global"], best = None, replace(best, error=math.inf)
 
         # --- The other ones, unless their eye paths alone are too dear ---
         light = seen.own + seen.later
-        later = within(light, light, weight) - within(seen.own, seen.own, weight)
-        if plan_of(use="none", later=later).error >= best.error:
-            return self._survey(best, errors, *read)
-        maps = [caustics(map_) for map_ in self.maps]
-        found = self.reader.found(maps, seen.points, lambda _: weight)
-        work = _GOING_ON * asks * seen.work
-        plan = plan_of(use="caustic", found=found, later=later, work=work)
+        all_ = light + seen.caustic
+        own, going_on, whole = (within(v, v, weight) for v in (seen.own, light, all_))
+        alone = partial(self.plan_of, use="none", weight=weight, v_own=own)
+        if alone(later=going_on - own).error >= best.error:
+            return best, errors, read
+        maps, work = [caustics(map_) for map_ in self.maps], _GOING_ON * asks * seen.work
+        all_the_way = _Use("caustic", maps, seen.points, lambda _: weight, work, going_on - own)
+        plan, found, _ = self._plan(reader, all_the_way)
         errors["caustic"] = plan.error
-        if self._misses(seen.caustic, found, weight):
+        if self._misses(seen.caustic, found, weight, reader.pairs):
             errors["caustic"] = None
         elif plan.error < _BETTER * best.error:
-            best, read = plan, (maps[0], seen.points)
+            best, read = plan, all_the_way
         if self.scene.photons_are_dispensable:
             errors["none"] = None
-            doubt = _doubt(seen.caustic, found.maps, weight)
+            doubt = _doubt(seen.caustic, found.maps, weight, reader.pairs)
             if doubt:
-                all_ = light + seen.caustic
-                of_caustics = within(all_, all_, weight) - within(light, light, weight)
-                plan = plan_of(use="none", later=later + doubt * of_caustics)
+                plan = alone(later=going_on - own + doubt * (whole - going_on))
                 errors["none"] = plan.error
                 if plan.error < _BETTER_ALONE * best.error:
-                    best, read = plan, (None, None)
-        return self._survey(best, errors, *read)
+                    best, read = plan, None
+        return best, errors, read
 
     def _without_reading(self) -> Plan | None:
         """Path tracing, if photons could not better it by much were there no end of them, and were
@@ -318,26 +345,44 @@ class _Pilot:
             return None
         return close_if_maps_hold(self.reader.light(caustics(self.maps[0]), seen.points))
 
-    def _misses(self, light, found: Found, weight) -> bool:
+    def _misses(self, light, found: Found, weight, pairs=_ALL) -> bool:
         """Have the two maps too little of ``light``, which eye paths have met, to be chosen? Not
-        where photons are needed."""
+        where photons are needed. found: by these pairs."""
         if not self.scene.photons_are_dispensable:
             return False
         mean, as_many = _hits(light, weight)
         if mean < _NOTHING or as_many < _OFTEN:
             return False
-        least = min(_hits(each, weight)[0] for each in found.maps)
+        least = min(_hits(each, weight[pairs])[0] for each in found.maps)
         return found.met_by_any < _FEW_PHOTONS or least < _MISSED * mean
 
-    def _of_reading(self, points) -> tuple[Found, Callable[..., Plan], Any]:
-        """(what is found at the points, plans, weight of each pair) that go by all light there."""
-        own, weigh = self.seen.own, self.seen.tiles.weight
-        found = self.reader.found(self.maps, points, lambda gathered: weigh(own + gathered))
-        weight = weigh(own + found.light)
-        plan_of = partial(self.plan_of, weight=weight, v_own=within(own, own, weight))
-        return found, plan_of, weight
+    def _weight(self, gathered):
+        """Of each pair, by all light there."""
+        return self.seen.tiles.weight(self.seen.own + gathered)
 
-    def _survey(self, plan: Plan, errors, map_, points) -> Survey:
+    def _plan(self, reader: Reader, read: _Use) -> tuple[Plan, Found, Any]:
+        """(the best that can be done with a use of the map, what its pairs find, weight of each of
+        all pairs)."""
+        own, pairs = self.seen.own, reader.pairs
+
+        def weigh(gathered):
+            return read.weigh(reader.spread(gathered))
+
+        found = reader.found(read.maps, read.points, lambda gathered: weigh(gathered)[pairs])
+        weight = weigh(found.light)
+        plan = self.plan_of(
+            tiles=reader.tiles,
+            whole=self.seen.work[pairs],
+            work=None if read.work is None else read.work[pairs],
+            weight=weight[pairs],
+            v_own=within(own, own, weight),
+            found=found,
+            use=read.use,
+            later=read.later,
+        )
+        return plan, found, weight
+
+    def _survey(self, plan: Plan, errors, read: _Use | None = None) -> Survey:
         share, widths = (
             plan.tiles.to_pixels(plan.tiles.grid(v)) if v.size > 1 else v
             for v in (plan.share, plan.widths)
@@ -353,8 +398,8 @@ class _Pilot:
             aim=plan.aim,
             rare=self.scene.rare if plan.use != "none" else (),
             lobes=plan.lobes,
-            map=map_,
-            points=points,
+            map=read.maps[0] if read else None,
+            points=read.points if read else None,
         )
 
 
@@ -400,12 +445,12 @@ def _hits(light, weight) -> tuple[float, float]:
     return float(hits.mean()), float(hits.sum()) ** 2 / squares if squares else 0.0
 
 
-def _doubt(caustic, maps, weight) -> float | None:
+def _doubt(caustic, maps, weight, pairs=_ALL) -> float | None:
     """By what to multiply the variance that caustics are seen to have in path tracing: what rarely
     hits is noisier than a few hits tell. None where too little was found to tell; 1 where there is
-    next to nothing. caustic: found by eye paths; maps: light of each."""
+    next to nothing. caustic: found by eye paths; maps: light of each, read by these pairs."""
     mean, as_many = _hits(caustic, weight)
-    held = [_hits(light, weight)[0] for light in maps]
+    held = [_hits(light, weight[pairs])[0] for light in maps]
     # Many hits tell more than a photon that one map has by luck.
     there = min(held) if as_many >= _OFTEN else sum(held) / len(held)
     if there < _NOTHING:

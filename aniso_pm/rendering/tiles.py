@@ -4,7 +4,7 @@ follows from them for every pixel."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -52,12 +52,24 @@ class Tiles:
         return -(-self.height // self.edge) * self.split
 
     @property
+    def pairs(self) -> int:
+        return self.across * self.down
+
+    @property
     def lanes(self) -> int:
-        return 2 * SAMPLES * self.across * self.down
+        return 2 * SAMPLES * self.pairs
 
     @property
     def pixels(self) -> int:
         return self.width * self.height
+
+    def every_fourth(self) -> tuple[Tiles, np.ndarray] | None:
+        """(Every second tile across and down, as tiles twice as wide; their indices). None where a
+        quarter of the pairs tells nothing."""
+        if self.pairs < 4 * _FEWEST:
+            return None
+        chosen = self.grid(np.arange(self.pairs))[::2, ::2].ravel()
+        return replace(self, edge=2 * self.edge), chosen
 
     def positions(self, sensor, seed: int, sampler):
         """On the film, of all lanes, tiles row by row."""
