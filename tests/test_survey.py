@@ -1,8 +1,6 @@
 """What the survey finds, against what renderings of known noise show."""
 
 import gc
-import math
-import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,12 +10,11 @@ import numpy as np
 import pytest
 from aniso_pm.instruments import gallery
 from aniso_pm.map.photon_map import photon_flux, thinned
-from aniso_pm.rendering import pilot, plan, reading, survey
+from aniso_pm.rendering import pairs, pilot, plan, reading, survey
 from aniso_pm.rendering.decisions import WORTH_FOLLOWING
-from aniso_pm.rendering.film import border
 from aniso_pm.rendering.prepared import prepare
 from aniso_pm.rendering.settings import Settings
-from aniso_pm.rendering.tiles import COARSE, SAMPLES, Tiles
+from aniso_pm.rendering.tiles import SAMPLES, Tiles
 from aniso_pm.transport import eye
 from rooms import room, room_with_ball, room_with_plate
 
@@ -90,32 +87,6 @@ def test_kernels_are_wide_where_light_is_smooth_and_narrow_at_an_edge():
     bias2 = (0.04 + tiles.uncertainty(change.ravel())[:, 28]) / (2**1.5 - 1) ** 2
     w = widths[:, 28]
     np.testing.assert_allclose(bias2 * (w / 4) ** 3, 2 / 3 * 2e5 / (16e5 * w**2), rtol=1e-6)
-
-
-@pytest.mark.parametrize("edge", [1, 3])
-def test_tiles_cover_every_pixel_once(edge):
-    tiles = Tiles(edge, 10, 7)
-    numbers = np.arange(tiles.across * tiles.down).reshape(tiles.down, tiles.across)
-    pixels = tiles.to_pixels(numbers).reshape(7, 10)
-    for y in range(7):
-        for x in range(10):
-            assert pixels[y, x] == (y // edge) * tiles.across + x // edge
-
-
-@pytest.mark.parametrize("offset", [0, 3])
-def test_positions_reach_over_a_border_that_the_film_samples(variant_llvm_rgb, offset):
-    film = {"type": "hdrfilm", "width": 32, "height": 24, "crop_width": 10, "crop_height": 8}
-    film |= {"crop_offset_x": offset, "crop_offset_y": offset, "sample_border": True}
-    sensor = mi.load_dict({"type": "perspective", "film": film | {"rfilter": {"type": "gaussian"}}})
-    tiles = Tiles.of(sensor, 4096)
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, tiles.lanes)
-    found, edge = tiles.positions(sensor, 0, sampler).numpy(), border(sensor.film())
-    assert edge > 0
-    for values, size in zip(found, (10, 8), strict=True):
-        first = offset - edge
-        pixels = np.unique(np.floor(values)).astype(int)
-        np.testing.assert_array_equal(pixels, np.arange(first, first + size + 2 * edge))
 
 
 def test_variances_are_those_of_the_samples(variant_llvm_rgb):
@@ -256,7 +227,7 @@ def test_pairs_of_a_closed_room_are_traced_once(variant_llvm_rgb, monkeypatch):
     monkeypatch.setattr(eye, "eye_paths", eye_paths)
     world = mi.load_dict(room_with_ball(size=24))
     scene = replace(prepare(world, Settings(), False), chosen="survey")
-    seen = survey.look(scene, world.sensors()[0], 0)
+    seen = pairs.look(scene, world.sensors()[0], 0)
     assert dr.width(seen.points.lane) > 3 * seen.tiles.lanes
     assert len(traced) == 1
 
@@ -288,7 +259,7 @@ def test_work_is_counted_once_where_gather_points_need_more_room(variant_llvm_rg
     works = []
     for many in (100_000, 100):  # enough at once; too little at first
         monkeypatch.setattr(eye, "_room_at_first", lambda *_, many=many: many)
-        seen = survey.look(scene, sensor, 0)
+        seen = pairs.look(scene, sensor, 0)
         assert dr.width(seen.points.lane) > 100
         works.append(seen.work)
     np.testing.assert_array_equal(*works)
@@ -437,77 +408,6 @@ def test_gathers_of_a_pilot_are_recorded_once(variant_llvm_rgb, make):
     prepared = prepare(scene, Settings(map="global"), False).frozen()
     pilot.settle(prepared, scene.sensors()[0], 0, 16)
     assert prepared.launch.gather.n_recordings == 1
-
-
-def test_the_dark_counts_beside_what_is_bright():
-    """Errors are relative, but not of what nobody sees beside the bright part of a picture."""
-    tiles = Tiles(1, 40, 40)
-    even, part = np.full((40, 40), 0.8), np.full((40, 40), 1e-3)
-    part[:, 30:] = 1.0  # a quarter of the picture
-    for light, floor in ((even, 0.25 * 0.8), (part, 0.1)):
-        weight = tiles.weight(light.reshape(-1, 1)).reshape(40, 40)
-        expected = 1 / (light**2 + floor**2)
-        np.testing.assert_allclose(weight[:, [0, 20, -1]], expected[:, [0, 20, -1]], rtol=1e-6)
-
-
-def test_several_pairs_stand_for_each_pixel_of_a_small_film(variant_llvm_rgb):
-    film = {"type": "hdrfilm", "width": 5, "height": 3, "rfilter": {"type": "box"}}
-    sensor = mi.load_dict({"type": "perspective", "film": film})
-    tiles = Tiles.of(sensor, COARSE)
-    assert tiles.across * tiles.down >= 256 and tiles.edge == 1
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, tiles.lanes)
-    x, y = tiles.positions(sensor, 0, sampler).numpy().reshape(2, -1)[:, :: 2 * SAMPLES]
-    there = np.floor(y) * 5 + np.floor(x)  # the pixel of each pair
-    np.testing.assert_array_equal(tiles.to_pixels(there), np.arange(15))
-    np.testing.assert_array_equal(tiles.refined(there, Tiles.of(sensor, 20_000)), there)
-
-
-def test_a_film_of_one_pixel_has_nothing_to_tell_apart(variant_llvm_rgb):
-    tiles = Tiles(1, 1, 1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert tiles.counts(np.ones(1), np.ones(1), 16) is None
-
-
-def test_every_fourth_tile_is_one_of_twice_the_edge(variant_llvm_rgb):
-    film = {"type": "hdrfilm", "width": 101, "height": 75, "rfilter": {"type": "box"}}
-    sensor = mi.load_dict({"type": "perspective", "film": film})
-    all_ = Tiles.of(sensor, 2000)
-    few, pairs = all_.every_fourth()
-    assert few == replace(all_, edge=2 * all_.edge)
-    assert few.pairs == len(pairs) == few.across * few.down
-    of_row, of_column = np.divmod(np.arange(all_.pairs), all_.across)
-    # What these have is that of the tile in whose corner they are.
-    np.testing.assert_array_equal(few.refined(of_row[pairs], all_), of_row // 2 * 2)
-    np.testing.assert_array_equal(few.refined(of_column[pairs], all_), of_column // 2 * 2)
-    assert Tiles.of(sensor, 600).every_fourth() is None
-
-
-def test_a_part_of_the_pairs_reads_what_all_would_read_there(variant_llvm_rgb, monkeypatch):
-    scene = mi.load_dict(room_with_ball(size=64))
-    exact = Settings(edge_compensation=False)  # probes of edges are random
-    prepared = replace(prepare(scene, exact, False), chosen="survey")
-    sensor = scene.sensors()[0]
-    seen = survey.look(prepared, sensor, 0)
-    photons = prepared.with_(photon_count=1000)
-    maps = [photons.photon_map(0, k, 0, None, remember=True) for k in (0, 1)]
-    everyone = reading.Reader.of_all(prepared, sensor, None, 0, seen.tiles)
-    few = everyone.of_every_fourth(seen.points)
-    assert everyone.pairs.size == 4 * few.pairs.size
-    monkeypatch.setattr(reading, "_MET_BY_ALL", math.inf)
-    all_, some = (
-        reader.found(maps, seen.points, lambda gathered: np.ones(len(gathered)))
-        for reader in (everyone, few)
-    )
-    assert some.light.max() > 0
-    for name in ("a", "b", "wide_a", "wide_b", "met", "points"):
-        expected = getattr(all_, name)[few.pairs]
-        np.testing.assert_allclose(getattr(some, name), expected, rtol=1e-4, atol=1e-6)
-    corners = few.spread(some.wide_a)[few.pairs]
-    np.testing.assert_allclose(corners[:, 0], some.wide_a.mean(1))
-    monkeypatch.setattr(reading, "_TELL", 1e6)
-    assert everyone.of_every_fourth(seen.points) is None
 
 
 def test_uses_are_compared_by_a_part_of_the_pairs(variant_llvm_rgb, monkeypatch):

@@ -285,7 +285,7 @@ def test_maps_miss_what_they_have_too_little_of_or_too_few_photons_for(variant_l
     def misses(has=(light, light), photons=1000, needed=False, met=light):
         scene = SimpleNamespace(photons_are_dispensable=not needed)
         given = survey._Pilot(scene, None, 0, None, None, None, None)
-        return given._misses(met, SimpleNamespace(maps=has, met_by_any=photons), weight)
+        return given._misses(met, has, photons, weight)
 
     assert not misses()
     assert misses(photons=10)

@@ -19,7 +19,7 @@ from ..map import density
 from ..map.gather_points import take
 from ..map.photon_map import EMPTY
 from ..transport.focus import Focus, find
-from . import footprint, survey
+from . import footprint, pairs, survey
 from .film import one_each, sample_ray, wavelengths
 from .prepared import PILOT, PILOT_CAMERA, PILOT_EYE, Prepared, stream_seed
 from .settled import Settled
@@ -55,7 +55,7 @@ def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:
     count, radius = scene.settings.photon_count, scene.settings.initial_radius
     if scene.undecided:
         scene = replace(scene, chosen="survey")
-    seen = survey.look(scene, sensor, seed)
+    seen = pairs.look(scene, sensor, seed)
     focus = _focus(scene, seen.points)
     scene = scene.focused(focus)
     pilot = scene.with_(photon_count=_PATHS)

@@ -27,26 +27,18 @@ from functools import partial
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from ..map.gather_points import take
 from ..map.photon_map import PhotonMap, caustics
-from ..map.spectra import channel_mean
 from ..transport import aim
-from ..transport.survey_parts import Parts
-from ..transport.thinning import Thinning
 from ..transport.uses import Use
-from . import footprint
-from .allotment import FEW
-from .film import noise_share, rays_through
-from .plan import LEAST_SHARE, PASSES, STRATIFIED, Found, Plan, within
-from .prepared import PILOT, PILOT_FINE, PILOT_PAIRS, Prepared, stream_seed
-from .reading import Reader, dearer, pairwise
-from .tiles import COARSE, FINE, SAMPLES, Tiles, smooth
+from .film import noise_share
+from .pairs import Seen, pixel_counts
+from .plan import PASSES, Found, Plan, within
+from .prepared import Prepared
+from .reading import Reader, dearer
 
-# Work of an eye path: of its first ray, of a vertex.
-_CAMERA, _VERTEX = 0.3, 0.4
 # The same vertices of paths that go on after they have left gather points.
 _GOING_ON = 1.15
 # Work of eye paths where receivers are not Lambertian, whose parts they tell apart, so many times
@@ -71,7 +63,6 @@ _CLOSE = 1.5
 # Chance with which eye paths meet lamps in glossy caustics, about. Photons for these are worth
 # their time where such a part of the variance goes: they make passes dearer by a tenth or two.
 _CHANCE, _LITTLE = 0.1, 0.03
-_ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -107,58 +98,6 @@ class Survey:
     points: Any
 
 
-@dataclass(frozen=True)
-class Seen:
-    """What the pairs of eye paths saw, as (pairs, 2) but work, early (pairs).
-
-    own      light that every use leaves to eye paths.
-    later    light that the global map has, the caustic one not.
-    caustic  light that both have; glossy: the part of it that is glossy caustics.
-    work     of the whole path; early: of the path up to its first gathered part.
-    points   where they gather, or None.
-    tiles    of the pairs.
-    """
-
-    own: np.ndarray
-    later: np.ndarray
-    caustic: np.ndarray
-    glossy: np.ndarray
-    work: np.ndarray
-    early: np.ndarray
-    points: Any
-    tiles: Tiles
-
-
-def look(scene: Prepared, sensor, seed: int) -> Seen:
-    """Trace the pairs. scene: as for ``decide``."""
-    tiles = Tiles.of(sensor, COARSE)
-    sampler, ray, _, _ = _pairs(sensor, tiles, seed, PILOT_PAIRS)
-    scene = replace(scene, footprint=footprint.of(sensor, 1.0))  # measures paths
-    vertices = early = mi.Float(0)
-
-    def watch():
-        nonlocal vertices, early
-        vertices, early = (dr.zeros(mi.Float, tiles.lanes) for _ in range(2))
-
-        def see(lane, depth, si, bsdf, bs, active, scattered):
-            dr.scatter_add(vertices, mi.Float(1), lane, active)
-            dr.scatter_add(early, mi.Float(1), lane, active & ~scattered)
-
-        return see
-
-    # In closed rooms paths leave many: when there is no room, all of them are traced again.
-    room = 8 * tiles.lanes if scene.use == "survey" else 0
-    L, _, points = scene.trace(sampler, ray, room, watch=watch)
-    later = caustic = glossy = mi.Float(0)
-    if isinstance(L, Parts):
-        L, later, caustic, glossy = L.radiance, L.later, L.caustic, L.glossy
-    none = dr.zeros(mi.Float, tiles.lanes)
-    later, caustic, glossy = (pairwise(v + none) for v in (later, caustic, glossy))
-    own = pairwise(channel_mean(L) + none) - later
-    work, early = (_VERTEX * pairwise(v).mean(1) + _CAMERA for v in (vertices, early))
-    return Seen(own, later, caustic + glossy, glossy, work, early, points, tiles)
-
-
 def decide(
     scene: Prepared,
     sensor,
@@ -174,7 +113,7 @@ def decide(
     scene        where the use of the map is open: with ``chosen`` "survey".
     radius       bandwidth of the first pass, world units, if it is given: all kernels have it.
     each         see ``pilot.settle``.
-    seen         by the pairs (see ``look``).
+    seen         by the pairs (see ``pairs.look``).
     maps         two independent photon maps of as many light paths, or empty ones.
     light_paths  of a pass if they are given, else 0 or None.
     """
@@ -293,7 +232,8 @@ class _Pilot:
         best, found, weight = self._plan(reader, at_first)
         read: _Use | None = at_first
         errors["global"] = best.error
-        if self._misses(seen.later + seen.caustic, found, weight, reader.pairs):
+        lights = [reader.spread(light) for light in found.maps]
+        if self._misses(seen.later + seen.caustic, lights, found.met_by_any, weight):
             errors["global"], best = None, replace(best, error=math.inf)
 
         # --- The other ones, unless their eye paths alone are too dear ---
@@ -307,13 +247,14 @@ class _Pilot:
         all_the_way = _Use("caustic", maps, seen.points, lambda _: weight, work, going_on - own)
         plan, found, _ = self._plan(reader, all_the_way)
         errors["caustic"] = plan.error
-        if self._misses(seen.caustic, found, weight, reader.pairs):
+        lights = [reader.spread(light) for light in found.maps]
+        if self._misses(seen.caustic, lights, found.met_by_any, weight):
             errors["caustic"] = None
         elif plan.error < _BETTER * best.error:
             best, read = plan, all_the_way
         if self.scene.photons_are_dispensable:
             errors["none"] = None
-            doubt = _doubt(seen.caustic, found.maps, weight, reader.pairs)
+            doubt = _doubt(seen.caustic, lights, weight)
             if doubt:
                 plan = alone(later=going_on - own + doubt * (whole - going_on))
                 errors["none"] = plan.error
@@ -345,16 +286,16 @@ class _Pilot:
             return None
         return close_if_maps_hold(self.reader.light(caustics(self.maps[0]), seen.points))
 
-    def _misses(self, light, found: Found, weight, pairs=_ALL) -> bool:
+    def _misses(self, light, lights, met_by_any: int, weight) -> bool:
         """Have the two maps too little of ``light``, which eye paths have met, to be chosen? Not
-        where photons are needed. found: by these pairs."""
+        where photons are needed. lights: of each map, met_by_any: as of ``Found``."""
         if not self.scene.photons_are_dispensable:
             return False
         mean, as_many = _hits(light, weight)
         if mean < _NOTHING or as_many < _OFTEN:
             return False
-        least = min(_hits(each, weight[pairs])[0] for each in found.maps)
-        return found.met_by_any < _FEW_PHOTONS or least < _MISSED * mean
+        least = min(_hits(each, weight)[0] for each in lights)
+        return met_by_any < _FEW_PHOTONS or least < _MISSED * mean
 
     def _weight(self, gathered):
         """Of each pair, by all light there."""
@@ -403,41 +344,6 @@ class _Pilot:
         )
 
 
-def pixel_counts(plan: Plan, scene: Prepared, sensor, seed: int) -> np.ndarray | None:
-    """Samples of each pixel: where they differ most is a matter of a few pixels, so that many eye
-    paths look, and nothing is gathered."""
-    if plan.each < FEW:
-        return None
-    fine, coarse = Tiles.of(sensor, FINE), plan.tiles
-    sampler, ray, pixel, sample = _pairs(sensor, fine, seed, PILOT_FINE)
-    # Traced as in the passes, which replay what is recorded here.
-    scene = replace(scene, chosen=plan.use, lobes_matter=scene.worth_following(plan.lobes))
-    scene = replace(scene, footprint=footprint.of(sensor, 1.0))
-    few = dr.opaque(mi.Float, LEAST_SHARE, fine.lanes // SAMPLES)
-    thinning = None
-    if plan.share.min() < 1:
-        each = dr.opaque(mi.UInt32, SAMPLES, fine.lanes)
-        place = sample + dr.opaque(mi.UInt32, 0)  # not the sampler's own variable: as in passes
-        thinning = Thinning.of_pass(few, seed, pixel, place, each)
-    L, _, _ = scene.trace(sampler, ray, thinning=thinning)
-    own = pairwise(channel_mean(L) + dr.zeros(mi.Float, fine.lanes))
-    weight = fine.weight(own + coarse.refined(plan.gathered, fine)[:, None])
-    noise = STRATIFIED * within(own, own, weight) + coarse.refined(plan.noise, fine)
-    work = coarse.refined(smooth(coarse.grid(plan.path_work)).ravel(), fine)
-    return fine.counts(noise, work, plan.each)
-
-
-def _pairs(sensor, tiles: Tiles, seed: int, stream: int):
-    """(sampler, rays, half of a pair as a pixel of its own, sample in it) of all tiles' pairs."""
-    sampler = mi.load_dict({"type": "owen_sobol"})
-    lane = dr.arange(mi.UInt32, tiles.lanes)
-    pixel, sample = lane // SAMPLES, lane % SAMPLES
-    sampler.begin(stream_seed(seed, PILOT, stream), pixel, sample)
-    ray, _ = rays_through(sensor, sampler, tiles.positions(sensor, seed, sampler), 0.5)
-    dr.eval(ray)  # as in passes
-    return sampler, ray, pixel, sample
-
-
 def _hits(light, weight) -> tuple[float, float]:
     """Of light of pairs: (its mean, relative, and how many hits of equal light are as uneven)."""
     hits = (light * np.sqrt(weight)[:, None]).ravel()
@@ -445,12 +351,12 @@ def _hits(light, weight) -> tuple[float, float]:
     return float(hits.mean()), float(hits.sum()) ** 2 / squares if squares else 0.0
 
 
-def _doubt(caustic, maps, weight, pairs=_ALL) -> float | None:
+def _doubt(caustic, maps, weight) -> float | None:
     """By what to multiply the variance that caustics are seen to have in path tracing: what rarely
     hits is noisier than a few hits tell. None where too little was found to tell; 1 where there is
-    next to nothing. caustic: found by eye paths; maps: light of each, read by these pairs."""
+    next to nothing. caustic: found by eye paths; maps: light of each."""
     mean, as_many = _hits(caustic, weight)
-    held = [_hits(light, weight[pairs])[0] for light in maps]
+    held = [_hits(light, weight)[0] for light in maps]
     # Many hits tell more than a photon that one map has by luck.
     there = min(held) if as_many >= _OFTEN else sum(held) / len(held)
     if there < _NOTHING:
