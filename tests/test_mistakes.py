@@ -107,6 +107,12 @@ def test_a_scene_without_emitters_says_what_to_add():
     assert "no emitters" in text and "area" in text
 
 
+@pytest.mark.parametrize("target, words", [(5.0, "500% of the picture"), (0.9, "")])
+def test_a_target_error_that_looks_like_per_cent_is_told(target, words):
+    text = told(room(size=4), target_error=target)
+    assert words in text and ("target_error" in text) == bool(words), text
+
+
 @pytest.mark.parametrize(
     "radius, words",
     [(1e-4, "photons in the mean"), (0.6, "blur everything"), (0.1, ""), (0.0, "")],

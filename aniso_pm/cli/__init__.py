@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from aniso_pm._version import __version__
@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     except BaseException as error:
         if hasattr(error, "format_message"):  # typer's own: wrong usage
             command = getattr(getattr(error, "ctx", None), "command_path", "aniso-pm")
-            return _fail(2, f"{error.format_message()} (see {command} --help)", error)
+            return _fail(2, f"{_wrong_usage(error)} (see {command} --help)", error)
         if isinstance(error, InterruptError):
             return _fail(INTERRUPTED, str(error), error)
         if isinstance(error, typer.Abort | KeyboardInterrupt):
@@ -52,6 +52,14 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(error, SystemExit):
             raise
         return _fail(1, f"{type(error).__name__}: {one_line(error)}", error)
+
+
+def _wrong_usage(error: Any) -> str:
+    """Typer's message, with the value where what checked it (pydantic) leaves that out."""
+    message: str = error.format_message()
+    checks: list[dict[str, Any]] = getattr(error.__cause__, "errors", list)()
+    values = [repr(check["input"]) for check in checks if "input" in check]
+    return f"{message}, not {', '.join(values)}" if values else message
 
 
 def _fail(status: int, message: str, error: BaseException) -> int:

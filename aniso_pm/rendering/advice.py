@@ -36,6 +36,13 @@ def before(scene: Prepared) -> None:
         )
     _ray_offset(scene)
     _large_radius(scene)
+    target = scene.settings.target_error
+    if target >= 1:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'aniso_pm: parameter "target_error" is {target:g}: rendering ends at a standard error '
+            f"of {target:.0%} of the picture. It is relative: 0.02 is 2 %",
+        )
     passes = scene.settings.passes
     if mi.is_spectral and 0 < passes < SPECTRAL_PASSES:
         few = f"{passes} passes" if passes > 1 else "one pass"
