@@ -324,11 +324,16 @@ def test_what_blender_exports_renders_untouched(run, tmp_path):
     tests = Path(__file__).resolve().parent
     given = [tests / "blender_export.xml", "-D", f"assets={tests.parent / 'scenes'}", "--quiet"]
     ours = ["--integrator", "aniso_pm", "-p", "passes=4", "-p", "max_depth=12"]
+    pictures = {}
     for name, more in (("path", ["--spp", "1024"]), ("ours", [*ours, "--spp", "256"])):
-        status, _, stderr = run("render", *given, "-o", f"{name}.exr", *more)
-        assert (status, stderr) == (0, "")
-    images = [np.array(mi.Bitmap(f"{name}.exr").split()[0][1]) for name in ("path", "ours")]
-    path, found = (image[..., :3].astype(float) for image in images)
+        for seed in range(3):
+            output = f"{name}_{seed}.exr"
+            status, _, stderr = run("render", *given, "-o", output, "--seed", seed, *more)
+            assert (status, stderr) == (0, "")
+            picture = np.array(mi.Bitmap(output).split()[0][1])[..., :3]
+            pictures.setdefault(name, []).append(picture.astype(float))
+    # Rays off the metal that meet the lamp over glass are rare: 4 % of one picture, none of another.
+    path, found = (np.median(pictures[name], axis=0) for name in ("path", "ours"))
     assert found.mean() == pytest.approx(path.mean(), rel=0.02)
     # Pixel by pixel as far as noise allows: the camera looks where Blender's did.
     assert np.abs(found - path).mean() < 0.1 * path.mean()
