@@ -14,7 +14,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "docs" / "figures.md"
-# What a picture and its time follow from, warnings apart; before and after the modules moved into rooms.
+# What a picture and its time follow from (not warnings); before and after the modules moved.
 CODE = ("aniso_pm", "plugins", "scenes/*.xml")
 NOT = ("cli", "view", "distributed", "pictures", "instruments", "rendering/advice.py")
 OLD = ("bench", "explain", "report", "stability", "inspect.py", "doctor.py", "gallery.py")
