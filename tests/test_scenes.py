@@ -41,7 +41,7 @@ def test_glass_balls_agree_with_their_reference_at_half_the_size():
 @pytest.mark.parametrize("name", ["teapot", *slow("fry_pan")])
 def test_kernels_follow_the_metal_and_fallbacks_are_rare(name):
     scene = mi.load_file(str(SCENES / f"{name}.xml"), width="64", height="48")
-    plugin = mi.load_dict({"type": "aniso_pm", "kernel": "anisotropic"})
+    plugin = mi.load_dict({"type": "aniso_pm", "kernel": "anisotropic", "map": "global"})
     mi.render(scene, integrator=plugin, spp=16)
     counts = plugin.statistics
     assert counts["gather_points_anisotropic"] > 0.1 * counts["gather_points"]
