@@ -209,8 +209,8 @@ class Plan:
         samples, eye_work = each * tiles.pixels, float(work.mean())
         light, aimed = LIGHT_PATH + LEFT * found.stored / found.emitted, 1.0
         # Were all eye paths to gather: C_g, and C_m through kernels of the first width.
-        point, photon = (smooth(tiles.grid(v)).ravel() for v in (found.points, found.met))
-        point, photon = _GATHER * point, _MET * photon / found.emitted
+        point = _GATHER * smooth(tiles.grid(found.points)).ravel()
+        photon = _MET * smooth(tiles.grid(found.met)).ravel() / found.emitted
         if found.aim:
             light, photon = light * found.aim.work, photon * found.aim.photons
             aimed = found.aim.variance

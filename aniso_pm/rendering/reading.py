@@ -84,13 +84,13 @@ class Reader:
         maps = self._few_enough(maps, points, kernels[0], wider)
         found: list[Any] = []
         weight = self._unweighted
-        for each in kernels:
+        for kernel in kernels:
             if found:
                 weight = weigh(0.5 * (found[0][0][0] + found[0][1][0]))
                 weight = arrays.own(mi.Float, np.repeat(weight, 2 * SAMPLES).astype(np.float32))
             scores = [self._scores(map_, weight) for map_ in maps]
             pairs = zip(maps, scores, strict=True)
-            found.append([self._gathered(each, points, *pair) for pair in pairs])
+            found.append([self._gathered(kernel, points, *pair) for pair in pairs])
         (a, over_lobes, met), (b, _, _) = found[0]
         (wide_a, _, _), (wide_b, _, _) = found[1]
         asks = dearer(points, _ASKS)

@@ -258,4 +258,4 @@ def _lobe(emitters) -> tuple[np.ndarray | None, float | None]:
         return (mean / length, None) if length > _ALIKE else (None, -1.0)
     if length < _COMMON or len(emitters) > 1:
         return None, -1.0
-    return mean / length, min(float((d @ mean).min()) / length, _ALIKE)
+    return mean / length, min(float(np.min(d @ mean)) / length, _ALIKE)

@@ -62,7 +62,7 @@ def neighbours(points: np.ndarray, most: int) -> list[list[int]]:
         # Points at one place are told apart as well.
         sizes = [r.max() if len(g) > 1 else -1 for r, g in zip(reach, groups, strict=True)]
         at = int(np.argmax(sizes))
-        group, axis = groups.pop(at), reach[at].argmax()
+        group, axis = groups.pop(at), int(np.argmax(reach[at]))
         group.sort(key=lambda k: (points[k, axis], k))
         groups += [group[: len(group) // 2], group[len(group) // 2 :]]
     return groups
