@@ -332,7 +332,7 @@ def test_what_blender_exports_renders_untouched(run, tmp_path):
             assert (status, stderr) == (0, "")
             picture = np.array(mi.Bitmap(output).split()[0][1])[..., :3]
             pictures.setdefault(name, []).append(picture.astype(float))
-    # Rays off the metal that meet the lamp over glass are rare: 4 % of one picture, none of another.
+    # Rays off metal that meet the lamp over glass are rare: 4 % of one picture, none of another.
     path, found = (np.median(pictures[name], axis=0) for name in ("path", "ours"))
     assert found.mean() == pytest.approx(path.mean(), rel=0.02)
     # Pixel by pixel as far as noise allows: the camera looks where Blender's did.
