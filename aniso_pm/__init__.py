@@ -10,6 +10,7 @@ The mathematics is usable by itself: :mod:`aniso_pm.asg` (anisotropic spherical 
 :mod:`aniso_pm.kernel` (elliptical kernels).
 """
 
+import sys
 from pathlib import Path
 
 from aniso_pm import _llvm
@@ -34,5 +35,8 @@ from aniso_pm.pictures.denoising import denoise  # noqa: E402
 from aniso_pm.rendering import progress, state  # noqa: E402
 
 plugins.register()
+
+# Importable by the names under which they are public.
+sys.modules.update({f"{__name__}.progress": progress, f"{__name__}.state": state})
 
 __all__ = ["__version__", "asg", "denoise", "kernel", "ndf", "progress", "state", "warp"]

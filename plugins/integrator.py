@@ -13,6 +13,7 @@ import numpy as np
 from aniso_pm.errors import Unsupported
 from aniso_pm.rendering import progressive
 from aniso_pm.rendering.controls import Controls
+from aniso_pm.rendering.digest import scene_entries
 from aniso_pm.rendering.film import pixel_weights as film_weights
 from aniso_pm.rendering.layered import develop
 from aniso_pm.rendering.pilot import USUAL, automatic_radius
@@ -186,7 +187,8 @@ class AnisoPhotonMapper:
          ``standard_error`` (two passes or more). ``denoising`` is what a denoiser needs: picture,
          albedo and normal as a box filter gives them and, from eight passes on, the picture's
          standard error, as the layers ``denoising_picture``, ``denoising_albedo``,
-         ``denoising_normal`` and ``denoising_error``. All are in the attribute ``layers``, and in
+         ``denoising_normal`` and ``denoising_error``, besides ``denoising_filter``, the weights
+         of the film's filter. All are in the attribute ``layers``, and in
          the EXR that :monosp:`aniso-pm render` writes. (Default: none)
 
      * - hide_emitters
@@ -272,6 +274,7 @@ class AnisoPhotonMapper:
         self.checkpoint: Checkpoint | None = None
         self.elsewhere: Callable[[progressive.Run], None] | None = None
         self.first_pass = 0
+        self._contained = False  # in another integrator, which may call sample()
         self._last_map: tuple | None = None
         self._exposed: dict[str, Any] = {}
 
@@ -320,8 +323,9 @@ class AnisoPhotonMapper:
             )
             so_far(done.variance, done.layers, done.passes)
             # Not where the scene holds this integrator: both would live for ever, map and all.
-            if done.map and scene.integrator() is not self:
-                self._last_map = (scene, done.scene, done.map, done.radius)
+            if done.map and self._contained and scene.integrator() is not self:
+                left = (done.scene, done.map, done.radius)
+                self._last_map = (self._map_follows_from(scene), left)
             image = sensor.film().develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)
@@ -332,11 +336,11 @@ class AnisoPhotonMapper:
         """Radiance along rays; see ``mi.SamplingIntegrator.sample``.
 
         For integrators that contain this one. ``aov`` calls render() and then sample(), which
-        uses the map that render() has left; ``moment`` calls sample() alone, and each call traces
-        photons of its own, since the scene may have changed since the last one.
+        uses the map that render() has left, if nothing has changed since; ``moment`` calls
+        sample() alone, and each call traces photons of its own.
         """
-        left, self._last_map = self._last_map, None
-        if left is None or left[0] is not scene:
+        (follows_from, left), self._last_map = self._last_map or (None, None), None
+        if left is None or follows_from != self._map_follows_from(scene):
             prepared = prepare(scene, self.settings, self.hide_emitters)
             seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
             if mi.is_spectral:
@@ -347,13 +351,15 @@ class AnisoPhotonMapper:
             if self.settings.photon_count == 0:
                 prepared = prepared.with_(photon_count=USUAL)
             radius = self.settings.initial_radius or automatic_radius(prepared, ray, seed)
-            left = (scene, prepared, prepared.photon_map(seed, 0), radius)
-        _, prepared, map_, radius = left
+            left = (prepared, prepared.photon_map(seed, 0), radius)
+        prepared, map_, radius = left
         seed = int(mi.UInt32(sampler.next_1d() * 2**24)[0])
         seen = prepared.radiance(sampler, ray, map_, dr.opaque(mi.Float, radius), seed)
         return dr.select(active, seen.L, 0), seen.valid & active, []
 
     def aov_names(self):
+        """None; only integrators that contain this one ask."""
+        self._contained = True
         return []
 
     def render_forward(self, *args, **kwargs):
@@ -363,6 +369,17 @@ class AnisoPhotonMapper:
         raise NotImplementedError(_NO_DERIVATIVES)
 
     # --- Ours ---
+
+    def __setattr__(self, name, value):
+        if name in _PARAMETERS:
+            raise AttributeError(
+                f'aniso_pm: "{name}" is a parameter, not an attribute; write '
+                f"integrator.settings = integrator.settings.with_({name}={value!r})"
+            )
+        mi.SamplingIntegrator.__setattr__(self, name, value)
+
+    def _map_follows_from(self, scene):
+        return id(scene), scene_entries(scene), self.parameters()
 
     def _so_far(self, weights, variance, sums, passes):
         names = self.settings.layer_names
@@ -384,6 +401,9 @@ class AnisoPhotonMapper:
         values = ",\n  ".join(f"{name} = {value}" for name, value in self.parameters().items())
         return f"AnisoPhotonMapper[\n  {values}\n]"
 
+
+# What is an attribute as well holds the layers that were rendered.
+_PARAMETERS = {field.name for field in fields(Settings)} - {"layers"}
 
 _NO_DERIVATIVES = (
     "aniso_pm: derivatives are not supported (density estimation is not differentiable with "

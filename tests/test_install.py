@@ -72,6 +72,12 @@ def test_an_old_llvm_loaded_earlier_is_refused_with_both_remedies(tmp_path):
     assert f"set {_llvm.VARIABLE}={_llvm.find_library()}" in last_line(run)
 
 
+def test_public_modules_are_importable_by_their_names(tmp_path):
+    code = "from aniso_pm.progress import bar\nfrom aniso_pm.state import Checkpoint\n"
+    code += "import aniso_pm.state as state; print(state.Checkpoint is Checkpoint)"
+    assert run_python(code, tmp_path).stdout == "True\n"
+
+
 def test_scalar_variants_work_beside_an_old_llvm_and_llvm_variants_are_refused(tmp_path):
     code = PRETEND_OLD + (
         "import mitsuba as mi; mi.set_variant('scalar_rgb'); import aniso_pm\n"

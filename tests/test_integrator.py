@@ -180,6 +180,38 @@ def test_inside_moment_it_sees_the_scene_as_it_is_now(rgb):
     assert before > 0.05 and after == 0
 
 
+def dim(scene, plugin):
+    parameters = mi.traverse(scene)
+    parameters["light.emitter.radiance.value"] = mi.Color3f(1e-3)
+    parameters.update()
+
+
+def stay_below(scene, plugin):
+    plugin.settings = plugin.settings.with_(max_depth=2)
+
+
+@pytest.mark.parametrize("change", [dim, stay_below])
+def test_inside_moment_no_map_is_used_that_a_render_left_before_a_change(rgb, change):
+    scene = mi.load_dict(room(size=8))
+    plugin = integrator()
+    outer = mi.load_dict({"type": "moment", "image": plugin})
+    mi.render(scene, integrator=plugin, spp=4)
+    change(scene, plugin)
+    first, second = (array(mi.render(scene, integrator=outer, spp=64))[..., :3] for _ in range(2))
+    assert first.mean() == pytest.approx(second.mean(), rel=0.1)
+
+
+def test_no_map_is_left_where_no_integrator_contains_it(scene):
+    plugin = integrator()
+    mi.render(scene, integrator=plugin, spp=1)
+    assert plugin._last_map is None
+
+
+def test_parameters_are_not_set_as_attributes(rgb):
+    with pytest.raises(AttributeError, match=r"\"passes\" is a parameter.*with_\(passes=4\)"):
+        integrator().passes = 4
+
+
 def test_isotropic_and_anisotropic_are_the_same_where_nothing_is_anisotropic(rgb):
     scene = mi.load_dict(room(size=8))
     images = [

@@ -80,6 +80,11 @@ def test_samples_are_shared_evenly_and_open_ends_take_short_passes(parameters, s
     assert [shares(i) for i in range(len(each))] == each
 
 
+def test_a_first_pass_below_zero_is_refused():
+    with pytest.raises(ValueError, match="first_pass is -1; passes are counted from 0"):
+        render(load(), integrator(), 2, first_pass=-1)
+
+
 def test_sample_numbers_that_a_pixel_does_not_have_are_refused():
     with pytest.raises(ValueError, match="beyond sample 536870912 of a pixel; count them from"):
         schedule.shares(Settings(passes=1), 1024, 64, first_pass=5_000_000)

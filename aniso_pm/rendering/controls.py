@@ -43,6 +43,12 @@ class Controls:
     spread: bool = True
     elsewhere: Callable[[Run], None] | None = None
 
+    def __post_init__(self):
+        if self.first_pass < 0:
+            raise ValueError(
+                f"aniso_pm: first_pass is {self.first_pass}; passes are counted from 0"
+            )
+
 
 @dataclass
 class Rendered:
