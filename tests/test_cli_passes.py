@@ -39,7 +39,7 @@ def test_passes_rendered_apart_merge_into_the_whole(run, write_scene):
     run("render", path, "-o", "b.exr", "--passes", 2, "--spp", 4, "--first-pass", 2, *options)
     run("render", path, "-o", "c.exr", "--passes", 1, "--spp", 2, "--first-pass", 4, *options)
     status, stdout, stderr = run("merge", "a.state", "b.exr", "-o", "ab.exr")
-    assert (status, stdout, stderr) == (0, "", "")
+    assert (status, stdout, stderr) == (0, "ab.exr: 4 passes of 2 states\n", "")
     status, stdout, _ = run("merge", "ab.exr", "c.exr", "-o", "abc.exr", "--png", "--json")
     assert status == 0 and json.loads(stdout)["passes"] == [[0, 5]]
     assert_same_picture("all.exr", "abc.exr")

@@ -291,6 +291,8 @@ def merge(
     if as_json:
         record |= {"output": str(out), "png": str(pictures.png) if pictures.png else None}
         print(json.dumps(output.plain(record), indent=2, ensure_ascii=False))
+    else:
+        print(f"{out}: {total.count} passes of {len(loaded)} states")
     return 0
 
 
