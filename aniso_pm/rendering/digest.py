@@ -107,7 +107,6 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
 
 def _hash(thing, with_sampler: bool = True) -> str:
     text = re.sub(r"(sample_count|samples_per_wavefront|wavefront_size) = \d+", "", str(thing))
-    text = re.sub(r"-0\b(?!\.)", "0", text)
     if not with_sampler:
         text = re.sub(r"sampler = \w+ ?\[[^]]*\]", f"sampler = {_DEFAULT_SAMPLER}", text)
     pieces: list[str | bytes] = [text]
@@ -123,15 +122,11 @@ def _hash(thing, with_sampler: bool = True) -> str:
 
 
 def _content(value) -> bytes:
-    value = getattr(value, "matrix", value)  # of a transform
     try:
         array = np.ascontiguousarray(value)
     except Exception:
         return str(value).encode()
-    if array.dtype == object:
-        return str(value).encode()
-    # Without the sign of zeros, which editing a transform and taking that back can leave.
-    return (array + array.dtype.type(0)).tobytes() if array.dtype.kind == "f" else array.tobytes()
+    return array.tobytes() if array.dtype != object else str(value).encode()
 
 
 def _digest(*pieces: str | bytes) -> str:
