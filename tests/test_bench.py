@@ -172,9 +172,7 @@ def test_a_scene_without_reference_is_refused_with_how_to_make_one(own_cache, wr
     capsys.readouterr()
     assert cli.main([*command, *size]) == 0
     rows = json.loads(capsys.readouterr().out)
-    # Busy machines end no pass in time, and say so.
-    said = ("reference's own error", "took longer")
-    assert all(any(words in row["note"] for words in said) for row in rows)
+    assert all("reference's own error" in row["note"] for row in rows)
 
 
 def test_a_run_without_a_picture_in_time_is_a_note_and_no_number(
@@ -194,7 +192,8 @@ def test_a_run_without_a_picture_in_time_is_a_note_and_no_number(
     assert cli.main(["bench", "error", "--quick", "--scene", str(scene), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert rows and all(row["figure"] is None for row in rows)
-    assert all("in 3 of 3 runs" in row["note"] for row in rows)
+    for words in ("in 3 of 3 runs", "reference's own error"):
+        assert all(words in row["note"] for row in rows)
 
 
 def test_bench_prints_json(capsys):
@@ -220,7 +219,6 @@ def test_the_whole_benchmark_runs_quickly(capsys):
     assert cli.main(["bench", "all", "--quick", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert {row["name"].split(":")[0] for row in rows} == set(GROUPS)
-    # Large pictures are too slow for that, and all are on a busy machine; rows say so.
+    # Large pictures are too slow for that, and say so.
     quick = [row for row in rows if not row["name"].startswith("large")]
-    late = [row for row in quick if "took longer" in row["note"]]
-    assert all(row["figure"] is not None for row in quick if row not in late), quick
+    assert all(row["figure"] is not None for row in quick), quick
