@@ -16,7 +16,7 @@ from . import film as films
 from .allotment import Allotment
 from .controls import Controls
 from .layered import Layered
-from .pilot import photons_per_path, settle
+from .pilot import look_for_shadows, photons_per_path, settle
 from .prepared import Prepared
 from .schedule import Shares, sample_count, shares
 from .settled import Settled
@@ -105,6 +105,7 @@ def decide(
     films.begin(film, bool(controls.callback or controls.checkpoint))
 
     # --- What is chosen ---
+    scene = look_for_shadows(scene, sensor)
     scene, settled = _settle(scene, sensor, seed, share.each, known)
     settled = replace(
         settled,

@@ -18,10 +18,11 @@ import numpy as np
 from ..map import density
 from ..map.gather_points import take
 from ..map.photon_map import EMPTY
+from ..transport import shadows
 from ..transport.focus import Focus, find
 from . import footprint, pairs, survey
 from .film import one_each, sample_ray, wavelengths
-from .prepared import PILOT, PILOT_CAMERA, PILOT_EYE, Prepared, stream_seed
+from .prepared import PILOT, PILOT_CAMERA, PILOT_EYE, PILOT_SHADOWS, Prepared, stream_seed
 from .settled import Settled
 
 # Photons inside the cut kernel that the bandwidth aims at, in the median of the light.
@@ -44,6 +45,17 @@ def camera_rays(sensor, seed: int):
     time = mi.Float(sensor.shutter_open())
     ray, _ = sample_ray(sensor, time, mi.Float(0.5), sampler.next_2d(), aperture)
     return one_each(ray, _RAYS)
+
+
+def look_for_shadows(scene: Prepared, sensor) -> Prepared:
+    """The same scene with emitters drawn by what is seen of them. The same for every seed, since
+    passes of several renderings are merged."""
+    if scene.direct is None:
+        return scene
+    rays = camera_rays(sensor, 0)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(dr.opaque(mi.UInt32, stream_seed(0, PILOT, PILOT_SHADOWS)), _RAYS)
+    return replace(scene, direct=shadows.look(scene.scene, scene.direct, sampler, rays))
 
 
 def settle(scene: Prepared, sensor, seed: int, each: int) -> Settled:

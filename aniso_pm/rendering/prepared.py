@@ -39,7 +39,7 @@ _LIGHT_ROULETTE = 3
 EYE, PROBE, PHOTONS, PILOT, COLOUR, THINNING = range(6)
 # Those of the pilot: its photons, eye paths of the automatic radius, random camera rays, pairs,
 # their pixels, pairs of the finer look.
-_, PILOT_EYE, PILOT_CAMERA, PILOT_PAIRS, PILOT_PIXELS, PILOT_FINE = range(6)
+_, PILOT_EYE, PILOT_CAMERA, PILOT_PAIRS, PILOT_PIXELS, PILOT_FINE, PILOT_SHADOWS = range(7)
 
 
 @dataclass(frozen=True)

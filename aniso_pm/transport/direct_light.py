@@ -12,8 +12,8 @@ bright everywhere. Of an environment only that part counts which multiple import
 to this: the rest is better found by the directions in which paths go on [after the importance of
 Conty Estévez and Kulla 2018, without their tree]. A group is a single emitter as long as there are
 few, or as it is strong; neighbours in a group have the same chance. What stands between x and a
-lamp is not known: F keeps all of them in play. Emitters of weight 0 are never asked, as in
-``path``.
+lamp is known in the mean at best (see ``shadows``): F keeps all of them in play. Emitters of weight
+0 are never asked, as in ``path``.
 """
 
 from __future__ import annotations
@@ -176,6 +176,12 @@ class DirectLight:
             chance = dr.select(group == k, p, chance)
         chance *= dr.gather(mi.Float, self.alone, number, active)
         return ds.emitter.pdf_direction(si, ds, active) * chance
+
+
+def lit_sides(bsdf, si, ray) -> tuple[Any, Any]:
+    """(n, through) of a vertex that the ray has met, as ``Group.irradiance`` has them."""
+    n = dr.mulsign(mi.Vector3f(si.n), -dr.dot(ray.d, si.n))
+    return n, mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
 
 
 def _together(emitters, power: dict[int, float]) -> list[list[int]]:

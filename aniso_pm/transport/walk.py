@@ -20,7 +20,7 @@ from ..map.receivers import gathered_part, read_receiver, shining_pdf
 from ..map.spectra import channel_mean
 from . import layers
 from .chain import Chain
-from .direct_light import DirectLight
+from .direct_light import DirectLight, lit_sides
 from .lamps import Lamps
 from .rays import reach_of, spawn_ray
 from .survey_parts import Apart
@@ -172,9 +172,7 @@ def walk(scene, sampler, ray, options: WalkOptions, leave, see=None):
         # --- Direct light by emitter sampling ---
         bsdf = si.bsdf(ray)
         if dr.hint(o.direct is not None, mode="scalar"):
-            through = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
-            n = dr.mulsign(mi.Vector3f(si.n), -dr.dot(ray.d, si.n))
-            chances = o.direct.chances(si, n, through)
+            chances = o.direct.chances(si, *lit_sides(bsdf, si, ray))
         ds, light, wo, f, lit = _sample_light(scene, o, sampler, ctx, si, bsdf, β, chances, active)
         if dr.hint(o.use not in ("global", "none") and o.deep, mode="scalar"):
             # Over a walked part to a gathered one: the map has it.
